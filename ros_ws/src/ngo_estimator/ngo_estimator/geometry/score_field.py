@@ -37,7 +37,7 @@ class ScoreFieldConfig:
     cell_m: float = 0.06
     reach_m: float = 30.0
     deviation_m: float = 0.10
-    unknown: float = 0.4
+    unknown: float = 0.6
     passed: float = 1.5
 
     @property

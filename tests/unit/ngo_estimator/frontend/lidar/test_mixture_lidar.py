@@ -105,6 +105,19 @@ def test_a_corridor_leaves_the_way_along_it_to_the_wheels() -> None:
     assert last[0, 0] > 20.0 * last[1, 1]
 
 
+def test_what_was_seen_before_decides_whether_a_scan_fits() -> None:
+    lidar = MixtureLidar()
+    fed(records(way(20)), lidar)
+    core = lidar._core
+    placed = core._submap._scans[-1].points[::4]
+    new = np.stack((np.linspace(100.0, 110.0, 3 * len(placed)), np.full(3 * len(placed), 100.0)), -1)
+    seen_through = 0.5 * placed + 0.5 * core._pose[:2]
+    assert core._fits(np.concatenate((placed, new)), np.zeros(3))
+    assert not core._fits(np.concatenate((seen_through, new)), np.zeros(3))
+    assert not core._fits(new, np.zeros(3))
+    assert core._fits(new[:5], np.zeros(3))  # so few contradict nothing
+
+
 def test_without_wheels_a_robot_goes_on_where_nothing_changes() -> None:
     """Two pillars tell its motion; behind them the walls are smooth, and ranges look as if the robot stood."""
     left = ((2.0, 0.6), (2.3, 0.6), (2.3, 0.9), (2.0, 0.9))

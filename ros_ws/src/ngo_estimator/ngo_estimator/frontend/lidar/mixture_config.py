@@ -41,7 +41,6 @@ class MixtureConfig:
 
     # Search: windows cover all hypotheses, within limits.
     least: float = 0.07  # no hypothesis is surer than this where the place is chosen (m, rad)
-    least_share: float = 0.1  # and none rarer
     prior_weight: float = 0.025  # of the prior's logarithm against a mean score, which is less where scans usually fit:
     usual_misfit: float = 0.05  # what their points usually lack to 1, below which it is
     search_points: int = 120
@@ -57,7 +56,7 @@ class MixtureConfig:
     same_rad: float = 0.03
 
     # Lost, and segments.
-    lost_share: float = 0.6  # of the usual score, below which a scan fits nowhere
+    lost_share: float = 0.6  # of the usual score, below which what was seen before contradicts a scan
     lost_m: float = 0.8  # dead reckoning after which a segment begins
     lost_rad: float = 0.5
     doubted: float = 3.0  # factor on the deviations of dead reckoning to a new segment
@@ -95,6 +94,7 @@ _GONE = {
     "odometry": '"key_m", "key_deg", "submap_scans", "icp" and the search\'s settings stand in its place',
     "wheels": "lag, slips and freezes of wheels are learned without settings",
     "wheel_silence_s": _NOT_NEEDED,
+    "least_share": _NOT_NEEDED,
     "least_variance_m2": _NOT_NEEDED,
     "least_variance_rad2": _NOT_NEEDED,
 }

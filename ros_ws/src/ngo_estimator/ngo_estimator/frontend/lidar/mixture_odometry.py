@@ -35,8 +35,8 @@ from ngo_estimator.geometry.score_profile import held_along
 _FAR = 9.0
 """Squared deviations beyond which a prior counts less."""
 
-_BROAD = 0.15
-"""Deviation (m, rad) of the prior under which a mode is registered first."""
+_BROAD = 0.5
+"""Deviation of the prior under which a mode of the search is registered, as a part of that of anything."""
 
 _UNKNOWN = np.eye(3)
 """Information without which the walls may leave a direction open."""
@@ -173,8 +173,7 @@ class MixtureOdometry:
         few = _on_lines(other, self.config.search_points)
         if not len(few.points):
             return scan, found
-        prior, weight = self._prior(self.config.least_share), self._weight(few.points)
-        refound = self._sharpened(other, few, self._fit(few, ANY, found.pose, prior, weight))
+        refound = self._sharpened(other, few, self._fit(few, ANY, found.pose, self._weight(few.points)))
         refound = _widened(refound, self._doubt)
         return (other, refound) if refound.score >= found.score else (scan, found)
 
@@ -214,13 +213,15 @@ class MixtureOdometry:
             estimate = replace(estimate, walls=self._submap.walls(transformed(pose, scan.points)))
         return estimate
 
-    def _prior(self, share: float) -> Mixture:
-        """The prior of where the place is chosen, without a hypothesis below a ``share``.
+    def _prior(self, walls: Array | None, wide: bool = False) -> Mixture:
+        """The prior of where the place is chosen, as ``walls`` ``(3, 3)`` would measure it; ``wide`` where no place
+        that it has likely fits.
 
         A key scan is where the next ones count from, but its place among those before it is as doubtful as it was.
         """
         least = self.config.least, self.config.least
-        return self.mixture.prior(self._pose, self._covariance + self._doubted_key, None, least, share)
+        prior = self.mixture.prior(self._pose, self._covariance + self._doubted_key, walls, least)
+        return prior.widened(0.5 * self.config.most_window_m, 0.5 * math.pi) if wide else prior
 
     def _weight(self, points: Array) -> float:
         """Weight of a log likelihood against a score, which is a mean: of few points it says less, but neighbouring
@@ -245,25 +246,27 @@ class MixtureOdometry:
         points = few.points
         if not len(points):
             return None
-        # Few points contradict nothing: the prior decides.
-        least = config.lost_share * self._usual if len(points) >= _FEWEST else 0.0
-        prior, weight = self._prior(config.least_share), self._weight(points)
-        fits = [self._fit(few, k, None, prior, weight) for k in self._starts()]
+        weight, starts, fits = self._weight(points), self._starts(), list[_Mode]()
         for wide in (False, True):
-            if wide:
-                prior = prior.widened(0.5 * config.most_window_m, 0.5 * math.pi)
+            prior = self._prior(None, wide)
+            fits = [self._fit(few, k, None, weight, wide) for k in starts]
             for pose, _ in two_modes(
                 self._submap.field, points, self._window(prior, wide), prior, weight,
                 (config.apart_m, math.radians(config.apart_deg)), config.margin * weight,
             ):  # fmt: skip
                 if not any(self._is_same(pose, other.pose) for other in fits):
-                    fit = self._fit(few, ANY, pose, prior, weight)
+                    fit = self._fit(few, ANY, pose, weight, wide)
                     fits.append(replace(fit, total=fit.total - config.noise * weight))
-            fitting = sorted((fit for fit in fits if fit.score >= least), key=lambda fit: -fit.total)
-            if fitting:
-                best = self._sharpened(scan, few, fitting[0])
-                return self._doubted([best, *fitting[1:]], weight)
+            fits.sort(key=lambda fit: -fit.total)
+            if self._fits(points, fits[0].pose):
+                return self._doubted([self._sharpened(scan, few, fits[0]), *fits[1:]], weight)
         return None
+
+    def _fits(self, points: Array, pose: Array) -> bool:
+        """Whether those of the points that lie where something was seen fit; few contradict nothing."""
+        least = self.config.lost_share * self._usual
+        known = self._submap.field.scores(points, pose[None], least)[0]
+        return len(points) < _FEWEST or bool(known > least + 1e-6)  # rounding
 
     def _doubted(self, fits: list[_Mode], weight: float) -> _Mode:
         """The first mode with the covariance of all: a score is ``weight`` times a log likelihood."""
@@ -274,8 +277,7 @@ class MixtureOdometry:
                 modes.append(fit)
         if len(modes) == 1:
             return modes[0]
-        prior = self._prior(0.0)
-        logs = np.array([mode.score / weight + prior.log(mode.pose) for mode in modes])
+        logs = np.array([mode.score / weight + self._prior(mode.walls).log(mode.pose) for mode in modes])
         likelihoods = np.exp(np.minimum(logs - logs[0], 0.0))
         for mode, share in zip(modes[1:], likelihoods[1:] / likelihoods.sum(), strict=True):
             away = mode.pose - modes[0].pose
@@ -307,17 +309,19 @@ class MixtureOdometry:
             math.radians(config.heading_step_deg),
         )
 
-    def _fit(self, few: _Points, hypothesis: int, start: Array | None, prior: Mixture, weight: float) -> _Mode:
+    def _fit(self, few: _Points, hypothesis: int, start: Array | None, weight: float, wide: bool = False) -> _Mode:
         """A mode, registered under a hypothesis from where that has it, or from ``start`` ``(3,)``."""
         mean, covariance = self.mixture.expected(hypothesis, self._pose, self._covariance)
         if start is None:
             start, information = mean, inverted(covariance)
         else:
-            broad = np.diag(np.full(3, _BROAD**-2))
+            metres, radians = _BROAD * self.mixture.deviations[ANY]
+            broad = np.diag((metres**-2, metres**-2, radians**-2))
             information = broad * min(1.0, _FAR / max(squared_deviations(start, mean, broad), 1e-9))
         found = self._icp(few, start, mean, information, self.config.icp)
-        score = self._submap.field.score(few.points, found.pose)
-        return _Mode(found, hypothesis, score, score + weight * prior.log(found.pose))
+        # Along a direction that walls leave open a hypothesis counts by its weight, however sure it is.
+        mode = _Mode(found, hypothesis, self._submap.field.score(few.points, found.pose), 0.0)
+        return replace(mode, total=mode.score + weight * self._prior(mode.walls, wide).log(found.pose))
 
     def _sharpened(self, scan: KeyScan, few: _Points, mode: _Mode) -> _Mode:
         """A mode of the ``few`` points, registered with all of the scan's under the hypothesis that is likeliest."""

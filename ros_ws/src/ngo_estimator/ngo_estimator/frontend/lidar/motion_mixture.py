@@ -120,15 +120,13 @@ class MotionMixture:
         changes = np.sqrt(self._deviations[hypothesis] ** 2 + share * self._deviations[ANY] ** 2)
         self._foretold[hypothesis] = self.filter.predicted(self._yaw, self._steps[hypothesis], periods, changes)
 
-    def prior(
-        self, pose: Array, covariance: Array, walls: Array | None, least: tuple[float, float], share: float = 0.0
-    ) -> Mixture:
+    def prior(self, pose: Array, covariance: Array, walls: Array | None, least: tuple[float, float]) -> Mixture:
         """The mixture of poses after ``pose`` ``(3,)`` with its covariance ``(3, 3)``, as ``walls`` ``(3, 3)`` would
-        measure them; no deviation is below ``least`` (m, rad), and no weight below ``share``."""
+        measure them; no deviation is below ``least`` (m, rad)."""
         joint = self._foretold[LAST][0], self._foretold[VELOCITY][0]
         walls = _KNOWN if walls is None else walls
         means = _formed(
-            pose, self._steps, self._usable, self._deviations, covariance, *joint, walls, self._weights, least, share
+            pose, self._steps, self._usable, self._deviations, covariance, *joint, walls, self._weights, least
         )
         return Mixture(*means)
 
@@ -309,7 +307,7 @@ def _shared(
 @njit(cache=True)
 def _formed(
     pose: Array, steps: Array, usable: NDArray[np.bool_], own: Array, covariance: Array, last: Array, velocity: Array,
-    walls: Array, weights: Array, least: tuple[float, float], share: float,
+    walls: Array, weights: Array, least: tuple[float, float],
 ) -> tuple[Array, Array, Array]:  # fmt: skip
     """Means, deviations and logarithms of weights of the mixture after ``pose`` ``(3,)``."""
     n = int(usable.sum())
@@ -324,7 +322,7 @@ def _formed(
             position = 0.5 * (spread[0, 0] + spread[1, 1] + walls[0, 0] + walls[1, 1])
             deviations[i, 0] = math.sqrt(more_m**2 + position + least[0] ** 2)
             deviations[i, 1] = math.sqrt(more_rad**2 + spread[2, 2] + walls[2, 2] + least[1] ** 2)
-            logs[i] = max(weights[k], share)
+            logs[i] = weights[k]
             i += 1
     total = logs.sum()
     for i in range(n):
