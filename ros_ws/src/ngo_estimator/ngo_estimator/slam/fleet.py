@@ -198,7 +198,7 @@ class Fleet:
     def trajectory(self, robot: str) -> Trajectory | None:
         """The frames of a robot that are in the map in which it is now, in that map; None before its first step.
 
-        Where its clock went back, the frames from there on alone.
+        Where its clock went back, the frames from there on alone. ``online_xyyaw`` is as the graph had it, in no map.
         """
         whole = self.core.trajectory() if robot in self._streams else None
         if whole is None:
