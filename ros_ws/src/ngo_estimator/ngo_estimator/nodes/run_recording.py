@@ -169,11 +169,11 @@ def _run(arguments: Arguments, out: Path, console: Console) -> dict[str, Any]:
         if arguments.uses_camera(recording):
             world, topics, core, events = _camera(arguments, recording, console)
         elif is_lidar(folder := arguments.weights_folder(recording)):
-            source = scan_source(folder)
             world, topics, core, events = _lidar(arguments, folder, recording, console)
-        else:
             source = scan_source(folder)
+        else:
             world, topics, core, events = _networks(arguments, folder, recording, console)
+            source = scan_source(folder)
         import_module("ngo_estimator.nodes.recorded_output")  # with matplotlib: no work on frames
         began_s = time.monotonic()
         trajectories = _write(arguments, out, recording, topics, core, events, source, console)
