@@ -49,6 +49,18 @@ def test_a_long_frontier_is_cut_into_connected_pieces() -> None:
     assert sum(piece.size_m for piece in pieces) == pytest.approx(0.1 * (2 * 50 + 2 * 10 - 4), abs=0.6)
 
 
+def test_a_frontier_across_the_grid_is_as_long_as_it_is() -> None:
+    """A diagonal of 19 cells is 1.4 times as long as 19 cells in a row."""
+    values = np.full((40, 40), -1, np.int8)
+    for k in range(20):
+        values[10 + k, : 11 + k] = 0
+    values[:11, :] = values[30:, :] = values[:, 0] = 100
+    known = known_of(values)
+    (diagonal,) = FrontierFinder(0.0, 10.0).find(known)
+    (counted,) = FrontierFinder(0.0, 10.0, by_cells=True).find(known)
+    assert counted.size_m == pytest.approx(1.9) and diagonal.size_m == pytest.approx(2.0**0.5 * 1.8 + 0.1)
+
+
 def test_gain_is_the_unknown_area_that_rays_reach() -> None:
     values = np.zeros((101, 101), np.int8)
     values[:, 51:] = -1

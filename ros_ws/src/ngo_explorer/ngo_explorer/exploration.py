@@ -60,7 +60,7 @@ class Exploration:
         self.candidates: Sequence[Candidate] = ()
         self.unreachable: Sequence[Unreachable] = ()
         self._boundary = Boundary(boundary)
-        self._finder = FrontierFinder(config.frontier_m, math.inf if self._lite else 2.5)
+        self._finder = FrontierFinder(config.frontier_m, math.inf if self._lite else 2.5, by_cells=self._lite)
         self._rule = make_rule(config, np.random.default_rng(seed))
         self._aside = PutAside()
         self._trail: list[Floats] = []
