@@ -94,6 +94,8 @@ class CameraModel:
 
     def pixels(self, rays: Array) -> tuple[Array, np.ndarray]:
         """Pixels ``(n, 2)`` that look along rays ``(n, 3)`` in base axes, and whether each is before the camera."""
+        if len(rays) == 0:
+            return np.zeros((0, 2)), np.zeros(0, bool)
         seen = rays @ self.base_from_camera[:, :3]
         ahead = seen[:, 2] > 1e-3 * np.linalg.norm(rays, axis=1)
         flat = np.where(ahead[:, None], seen, (0.0, 0.0, 1.0)).reshape(-1, 1, 3)
