@@ -1,12 +1,13 @@
 """The settings of a lidar's estimators: what is wrong with a file is one clear line."""
 
 import json
+import sys
 from pathlib import Path
 from typing import Any
 
 import pytest
 
-from ngo_estimator.data.lidar_file import LIDAR_FILE, LidarFileError, is_lidar, read_lidar_file
+from ngo_estimator.data.lidar_file import LIDAR_FILE, LidarFileError, is_lidar, read_lidar_file, require_opencv
 from ngo_estimator.frontend.lidar.mixture_config import MixtureConfig, read_mixture_config
 from ngo_estimator.loops.scan_settings import ScanGraphConfig
 from ngo_estimator.slam.scan_trajectory import ScanTrajectory
@@ -97,3 +98,11 @@ def test_a_missing_file_is_told(tmp_path: Path) -> None:
     assert not is_lidar(tmp_path)
     with pytest.raises(LidarFileError, match="cannot be read"):
         read_mixture_config(tmp_path)
+
+
+def test_opencv_that_does_not_load_is_said_in_one_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "cv2.py").write_text('raise ImportError("libGL.so.1: cannot open shared object file")')
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.delitem(sys.modules, "cv2", raising=False)
+    with pytest.raises(ValueError, match=r"needs OpenCV, which cannot be imported \(libGL.so.1: cannot open"):
+        require_opencv()

@@ -39,10 +39,10 @@ def require_opencv() -> None:
     """Raise ``ValueError`` where OpenCV is not installed, which a camera without weights needs."""
     try:
         import_module("cv2")
-    except ModuleNotFoundError as error:
+    except ImportError as error:
         raise ValueError(
-            "world camera needs OpenCV, which is not installed: run make venv FOR=all, or pip install "
-            "opencv-python-headless"
+            f"world camera needs OpenCV, which cannot be imported ({' '.join(str(error).split())}): run make venv "
+            "FOR=all, or pip install opencv-python-headless"
         ) from error
 
 

@@ -75,7 +75,7 @@ class CameraInput:
 
     @property
     def _info_topics(self) -> tuple[str, ...]:
-        return info_topics(self._node.resolve_topic_name(self._topic))[: 1 + self._is_compressed]
+        return info_topics(self._node.resolve_topic_name(self._topic), self._is_compressed)
 
     def listen(self, listening: Listening, status: NodeStatus) -> None:
         """Subscribe to pictures, their calibration, odometry and transforms."""
@@ -97,7 +97,7 @@ class CameraInput:
             return
         topic = " or ".join(self._info_topics)
         try:
-            self._calibration = calibration_of(message, topic, self._topic)
+            self._calibration = calibration_of(message, topic, self._node.resolve_topic_name(self._topic))
         except ValueError as error:
             self._status.dropped("calibration", error)
             return

@@ -346,7 +346,7 @@ def _camera(arguments: Arguments, recording: Recording, console: Console) -> "St
 
     cv2.setNumThreads(1)
     topics = choose_topics(recording, replace(arguments.topics, action="none", twist="none"), with_wheels=True)
-    named = info_topics(topics.image)
+    named = info_topics(topics.image, recording.topics[topics.image].type_name == COMPRESSED_TYPE)
     info = next((name for name in named if name in recording.topics and recording.topics[name].count), None)
     if info is None:
         raise ValueError(
