@@ -267,6 +267,8 @@ BAD = {
     "key scan of another time": lambda s: replace(s, key=replace(s.key, scan=no_scan(s.stamp_ns - 1))),
     "huge key scan": lambda s: replace(s, key=replace(s.key, scan=huge_scan(s.stamp_ns))),
     "far points": lambda s: replace(s, key=replace(s.key, scan=huge_scan(s.stamp_ns, 10, 1e30))),
+    "no time": lambda s: replace(s, from_stamp_ns=s.stamp_ns, key=None),
+    "absurd odometry": lambda s: replace(s, odom_xyyaw=np.array([1e12, 0.0, 0.0])),
     "first scan of another time": lambda s: replace(s, origin_scan=no_scan(0)),
 }
 
@@ -284,6 +286,8 @@ def test_a_bad_step_is_refused_and_changes_nothing(bad: str) -> None:
     for step in steps[: keys[10]]:
         trajectory.update(step)
     rejected(trajectory, BAD[bad](steps[keys[10]]))
+    with pytest.raises(RejectedStep):
+        trajectory.begins_anew(BAD[bad](steps[keys[10]]))
     assert not trajectory.update(steps[keys[10]]).gap
 
 

@@ -161,16 +161,21 @@ class CorrectedTrajectory(ABC):
         self._work()  # it may move the newest pose
         return self._join_at(step, *bridged(*self._back_end.graph.newest(), pose_xyyaw, covariance))
 
-    def _join_at(self, step: RelativeStep, relative: np.ndarray, covariance: np.ndarray) -> TrajectoryUpdate:
+    def _join_at(
+        self, step: RelativeStep, relative: np.ndarray, covariance: np.ndarray, optimize: bool = True
+    ) -> TrajectoryUpdate:
         """Go on with another odometry; its first frame is ``relative`` ``(3,)`` to the newest one."""
         if not self.may_join(step):
             raise RejectedStep(f"step to {step.stamp_ns} ns has no key scan; expected one where an odometry begins")
         self._begin_result()
-        return self._take(step, self._log.join(step, relative, covariance), optimize=True)
+        return self._take(step, self._log.join(step, relative, covariance), optimize)
 
     def begins_anew(self, step: RelativeStep) -> bool:
-        """Whether a step is of another odometry, so that ``update`` would forget this trajectory."""
-        return self._log.is_restart(step)
+        """Whether a step is of another odometry, so that ``update`` would forget this trajectory.
+
+        Raises ``RejectedStep`` for a step that ``update`` would refuse, whatever came before it.
+        """
+        return self._log.is_restart(self._back_end.checked(step))
 
     def may_join(self, step: RelativeStep) -> bool:
         """Whether the trajectory can go on with another odometry from this step's frame."""
