@@ -89,6 +89,26 @@ def test_a_robot_that_starts_anew_is_found_again_and_lost_steps_cost_nothing() -
     assert off_m(fleet, "red", FIRST[0], truth) < 0.1
 
 
+@pytest.mark.parametrize("blue_first", [False, True])
+def test_the_map_of_all_begins_anew_with_the_first_robot_where_it_had_hardly_begun(blue_first: bool) -> None:
+    fleet, red = Fleet(ScanTrajectory(), ["red", "blue"]), robots()["red"]
+    if blue_first:
+        drive(fleet, "blue", robots()["blue"][:3])
+    drive(fleet, "red", red[:2])
+    for k in (2, 4):  # twice
+        begin = replace(red[k], origin_scan=red[k - 1].key.scan)  # type: ignore[union-attr]
+        again = [replace(step, origin_stamp_ns=step.from_stamp_ns + k) for step in (begin, red[k + 1])]
+        again[1] = replace(again[1], origin_stamp_ns=again[0].origin_stamp_ns)
+        told = drive(fleet, "red", again)
+        assert [update.map_of for update in told] == [None, None] and told[0].begins
+    np.testing.assert_allclose(told[0].update.pose_xyyaw, red[4].relative_xyyaw, atol=0.02)
+    whole = fleet.trajectory("red")
+    assert whole is not None and len(whole.stamps_ns) == 3
+    blue = drive(fleet, "blue", robots()["blue"][3:5] if blue_first else robots()["blue"][:3])
+    assert blue[-1].map_of == "blue"
+    assert fleet.core.newest().frames == (6 + 9 if blue_first else 3 + 4)
+
+
 def test_one_robot_alone_is_a_trajectory() -> None:
     fleet, core = Fleet(ScanTrajectory(), ["red"]), ScanTrajectory()
     for told, step in zip(drive(fleet, "red", robots()["red"][:30]), robots()["red"], strict=False):
@@ -96,6 +116,19 @@ def test_one_robot_alone_is_a_trajectory() -> None:
         core.correct()
         for name in ("pose_xyyaw", "covariance", "map_from_odom_xyyaw"):
             np.testing.assert_allclose(getattr(told.update, name), getattr(expected, name), atol=1e-12)
+
+
+def test_nothing_is_optimised_while_corrections_pause() -> None:
+    fleet, red = Fleet(ScanTrajectory(), ["red", "blue"]), robots()["red"]
+    for step in red[:-1]:
+        assert not fleet.update("red", step, optimize=False).update.optimized
+    loops = len(fleet.core.back_end.used_loops)
+    assert loops > 0 and not len(fleet.core.back_end.closed)
+    fleet.update("blue", robots()["blue"][0], optimize=False)
+    fleet.update("red", replace(red[-1], key=None), optimize=False)
+    fleet.update("red", own_odometry(carried_back())[0], optimize=False)  # it begins anew
+    fleet.correct()
+    assert not len(fleet.core.back_end.closed)
 
 
 def test_steps_wait_for_a_key_scan_and_are_answered_by_odometry() -> None:
@@ -132,7 +165,7 @@ def test_a_robot_that_went_impossibly_far_begins_anew_and_costs_the_others_nothi
     away = [replace(step, odom_xyyaw=step.odom_xyyaw + (1e8, 0.0, 0.0)) for step in robots()["red"][4:7]]
     told = drive(fleet, "red", [replace(away[0], key=None), *away[1:]])
     assert [update.begins for update in told] == [False, True, False]
-    assert told[-1].map_of == "red" and fleet.trajectory("red") is not None
+    assert told[-1].map_of is None and fleet.trajectory("red") is not None  # the map had hardly begun
     assert fleet.core.newest().frames == 4 + 4 + 2
 
 

@@ -67,6 +67,7 @@ class Fleet:
         self.core.reset()
         self._streams: dict[str, _Stream] = {}
         self._starts: dict[str, list[int]] = {robot: [] for robot in self.robots}  # ranks of all its streams
+        self._common = 0  # rank of the stream with which the map of all begins
 
     def update(self, robot: str, step: RelativeStep, optimize: bool = True) -> FleetUpdate:
         """Take the next step of a robot.
@@ -86,40 +87,58 @@ class Fleet:
                 stream.stamp_ns = step.stamp_ns
                 update = replace(self.core.newest(), optimized=False, largest_move_m=0.0)
                 return FleetUpdate(self._placed(robot, step, update), self.map_of(robot), begins=False)
-            self._take_waiting(stream)
+            self._take_waiting(stream, optimize)
             begins = self.core.begins_anew(step)
         if stream is None or begins:
-            update = self._begin(robot, step)
+            update = self._begin(robot, step, optimize)
         else:
             stream.stamp_ns, stream.odom_xyyaw = step.stamp_ns, step.odom_xyyaw
             update = self.core.update(step, optimize)
         return FleetUpdate(self._placed(robot, step, update), self.map_of(robot), begins)
 
-    def _begin(self, robot: str, step: RelativeStep) -> TrajectoryUpdate:
+    def _begin(self, robot: str, step: RelativeStep, optimize: bool) -> TrajectoryUpdate:
         before = self._streams.get(robot)
         if before is not None:
-            self._take_waiting(before)
+            self._take_waiting(before, optimize)
+            if self._has_hardly_begun(robot) and len(self.core.back_end.graph.ranks) == 1:
+                self.reset()
         rank = self._new_rank(robot)
-        update = self.core.begin_stream(step, rank)
+        update = self.core.begin_stream(step, rank, before is not None, optimize)
+        self._common = min(self._common, rank)
         self._starts[robot].append(rank)
         self._streams[robot] = _Stream(rank, step.origin_stamp_ns, step.stamp_ns, step.odom_xyyaw)
         return update
 
     def _new_rank(self, robot: str) -> int:
-        """That of the first robot's first stream is the lowest."""
-        count = len(self.robots)
-        return self.robots.index(robot) if not self._starts[robot] else count + sum(map(len, self._starts.values()))
+        """That of the stream with which the map of all begins is the lowest."""
+        if not self._starts[robot]:
+            return self.robots.index(robot)
+        count = len(self.robots) + sum(map(len, self._starts.values()))
+        return self._common - 1 if self._has_hardly_begun(robot) else count
+
+    def _has_hardly_begun(self, robot: str) -> bool:
+        """Whether the map of all shows too little to find anybody in it, and only its owner ``robot`` was there.
+
+        Then it begins with the robot's next start, or nobody would ever be in it again.
+        """
+        back_end, graph = self.core.back_end, self.core.back_end.graph
+        if robot != self.robots[0] or not self._starts[robot]:
+            return False
+        begin = int(graph.streams[graph.ranks == self._common][0])
+        keys = int((back_end.places(np.arange(len(graph)))[1] == begin).sum())
+        others = [begins for name, begins in zip(self._streams, self._places()[1], strict=True) if name != robot]
+        return keys < back_end.config.loops.submap_keys and begin not in others
 
     def _waits(self, stream: _Stream, step: RelativeStep) -> bool:
         is_last = int(self.core.back_end.graph.ranks[-1]) == stream.rank
         return not is_last and step.key is None and len(stream.waiting) < _MOST_WAITING
 
-    def _take_waiting(self, stream: _Stream) -> None:
+    def _take_waiting(self, stream: _Stream, optimize: bool) -> None:
         """Take the steps of a robot that wait, and let its next one follow them."""
         self.core.go_on_with(stream.rank)
         for step in stream.waiting:
             if not self.core.begins_anew(step):  # it went impossibly far: the next one begins anew
-                self.core.update(step)
+                self.core.update(step, optimize)
                 stream.odom_xyyaw = step.odom_xyyaw
         stream.waiting.clear()
 
@@ -143,7 +162,7 @@ class Fleet:
         parts, begins = self._places()
         graph = self.core.back_end.graph
         own = list(self._streams).index(robot)
-        if begins[own] in graph.streams[graph.ranks == 0]:
+        if begins[own] in graph.streams[graph.ranks == self._common]:
             return None
         there = [name for name, part in zip(self._streams, parts, strict=True) if part == parts[own]]
         return min(there, key=self.robots.index)

@@ -58,7 +58,7 @@ class ScanBackEnd(BackEnd):
         # Loops when the graph was last solved without a warm start, and the scale of variances that was found.
         self._loops_from_nothing, self._scale = 0, np.ones(1)
         self._own_map = OwnMap(config)
-        self._other_maps: dict[int, OwnMap] = {}  # by rank, of the streams but the last
+        self._other_maps: dict[int, OwnMap] = {}  # by rank, of the streams that go on, but the last
         self._parts = np.zeros(0, np.int64)  # the part of the map that each segment is in, when that was asked last
         self._claimed = np.zeros(0, np.int64)  # used loops by which the robot was found since the last optimisation
         self._waiting = 0  # keys since the last optimisation, where there is a loop that it has not seen
@@ -186,9 +186,13 @@ class ScanBackEnd(BackEnd):
         first, last = segment_of(self.graph.segments, pairs).T
         return pairs[(first == last) | (weight > BELIEVED)]
 
-    def begin_stream(self, rank: int) -> None:
-        """Begin another stream of steps with the next one, which begins a segment; all work is done."""
-        self._other_maps[int(self.graph.ranks[-1])] = self._own_map
+    def begin_stream(self, rank: int, ends: bool) -> None:
+        """Begin another stream of steps with the next one, which begins a segment; all work is done.
+
+        ``ends``: the stream before has ended, and is never gone on with.
+        """
+        if not ends:
+            self._other_maps[int(self.graph.ranks[-1])] = self._own_map
         self._own_map = OwnMap(self.config)
         self.graph.begin_stream(rank)
 

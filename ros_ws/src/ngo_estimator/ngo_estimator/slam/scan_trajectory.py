@@ -56,10 +56,13 @@ class ScanTrajectory(CorrectedTrajectory):
         """
         return self._join_at(replace(self._back_end.checked(step), segment=True), np.zeros(3), OPEN)
 
-    def begin_stream(self, step: RelativeStep, rank: int) -> TrajectoryUpdate:
+    def begin_stream(
+        self, step: RelativeStep, rank: int, ends: bool = False, optimize: bool = True
+    ) -> TrajectoryUpdate:
         """Take the first step of another odometry, which goes on beside those before; nobody knows where it is.
 
         The steps that follow are of this stream, which is named by its ``rank``, until ``go_on_with`` is called.
+        ``ends``: the stream before has ended, and is never gone on with.
 
         Raises:
             RejectedStep: as of ``update``; neither the step nor its beginning has a key scan.
@@ -68,16 +71,16 @@ class ScanTrajectory(CorrectedTrajectory):
         if self._log.steps == 0:
             self.reset()
             self._back_end.graph.share(rank)
-            return self.update(step)
+            return self.update(step, optimize)
         begin = first_frame(checked) or checked
         if not self.may_join(begin):
             raise RejectedStep(f"step to {step.stamp_ns} ns has no key scan; expected one where an odometry begins")
         self._work()
         present = int(self._back_end.graph.ranks[-1])
-        self._back_end.begin_stream(rank)
+        self._back_end.begin_stream(rank, ends)
         self._log.begin_stream(present)
-        update = self._join_at(replace(begin, segment=True), np.zeros(3), OPEN)
-        return update if begin is checked else self.update(step)
+        update = self._join_at(replace(begin, segment=True), np.zeros(3), OPEN, optimize)
+        return update if begin is checked else self.update(step, optimize)
 
     def go_on_with(self, rank: int) -> None:
         """Let the next step go on with another stream."""
