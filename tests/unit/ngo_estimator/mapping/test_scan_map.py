@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 
 from ngo_estimator.data.relative_step import RelativeStep
-from ngo_estimator.mapping.occupancy_grid import OccupancyGrid
+from ngo_estimator.mapping.occupancy_grid import MapTooLarge, OccupancyGrid
 from ngo_estimator.mapping.range_scan import RangeScan, range_scan
-from ngo_estimator.mapping.scan_map import ScanMap, ScanMapConfig
+from ngo_estimator.mapping.scan_map import ScanMap, ScanMapConfig, together
 
 FRAMES = 60
 STEP_NS = 100_000_000
@@ -206,6 +206,32 @@ def test_scans_that_are_withdrawn_leave_the_map_and_wait_for_their_poses() -> No
     np.testing.assert_array_equal(scan_map.cells().cropped().values, from_scratch(list(range(20)), path(0.01)))
     scan_map.update(stamps(30), path(0.01, 30))
     np.testing.assert_array_equal(scan_map.cells().cropped().values, from_scratch(list(range(30)), path(0.01)))
+
+
+def test_parts_of_a_trajectory_that_leave_it_and_come_again_are_drawn_again() -> None:
+    scan_map = ScanMap(EVERY, parts=True)
+    take(scan_map, range(30))
+    for first in (20, 0, 10, 0):  # found where it is now, joined with where it was, and parted
+        scan_map.update(stamps(30 - first, first), path(0.01, 30)[first:])
+        assert (len(scan_map), scan_map.waiting) == (30 - first, first)
+        drawn = from_scratch(list(range(first, 30)), path(0.01))
+        np.testing.assert_array_equal(scan_map.cells().cropped().values, drawn)
+    assert scan_map.withdraw() and (len(scan_map), scan_map.waiting) == (0, 30)
+
+
+def test_maps_that_are_too_large_together_get_larger_cells(monkeypatch: pytest.MonkeyPatch) -> None:
+    maps = [ScanMap(EVERY), ScanMap(EVERY)]
+    for one, away_m in zip(maps, (0.0, 90.0), strict=True):
+        take(one, range(20))
+        one.update(stamps(20), path(0.01, 20) + (away_m, 0.0, 0.0))
+    most = max(one.cells().values.size for one in maps)
+    monkeypatch.setattr("ngo_estimator.mapping.occupancy_grid._MOST_CELLS", most)
+    whole = together(maps)
+    assert whole.values.size <= most and whole.resolution_m > 0.05
+    assert {one.resolution_m for one in maps} == {whole.resolution_m}
+    monkeypatch.setattr("ngo_estimator.mapping.occupancy_grid._MOST_CELLS", 1)
+    with pytest.raises(MapTooLarge):
+        together(maps)
 
 
 def test_maps_of_several_robots_make_one() -> None:

@@ -70,10 +70,14 @@ class ScanMap:
     """Owns the grid, the scans in it and the poses at which each was entered.
 
     Scans wait until a trajectory says where they were taken.
+
+    Args:
+        parts: whether parts of a trajectory may leave it and come again, as those of a robot among several: then scans
+            before its first stamp wait as well.
     """
 
-    def __init__(self, config: ScanMapConfig | None = None) -> None:
-        self.config = config or ScanMapConfig()
+    def __init__(self, config: ScanMapConfig | None = None, parts: bool = False) -> None:
+        self.config, self._parts = config or ScanMapConfig(), parts
         self._source: tuple[int, int] | None = None  # origin and newest stamp of the steps
         self._run = 0  # counts the starts of the source
         self._last_odom: Array | None = None  # of the frame whose scan was taken last
@@ -230,11 +234,13 @@ class ScanMap:
         first, last = int(stamps_ns[0]), int(stamps_ns[-1])
         restarted = self._span is not None and (first != self._span[0] or last < self._span[1])
         if restarted or self._span is None:
+            if self._parts:
+                self.withdraw()
             self._forget()
             self._waiting = {
                 stamp: (run, scan)
                 for stamp, (run, scan) in self._waiting.items()
-                if run == self._run and stamp >= first
+                if run == self._run and (self._parts or stamp >= first)
             }
         self._span = first, last
         return restarted
@@ -271,9 +277,9 @@ class ScanMap:
         self._scans = [scan for scan, leaves in zip(self._scans, gone, strict=True) if not leaves]
         self._stamps, self._poses, self._reach = self._stamps[~gone], self._poses[~gone], self._reach[~gone]
 
-    def withdraw(self, stamps_ns: np.ndarray) -> bool:
-        """Let the scans of these stamps ``(n,)`` wait for their poses again; returns whether there were any."""
-        gone = np.isin(self._stamps, stamps_ns)
+    def withdraw(self, stamps_ns: np.ndarray | None = None) -> bool:
+        """Let scans, of these stamps ``(n,)`` or all, wait for their poses again; returns whether there were any."""
+        gone = np.isin(self._stamps, self._stamps if stamps_ns is None else stamps_ns)
         for slot in np.flatnonzero(gone).tolist():
             stamp = int(self._stamps[slot])
             self._waiting[stamp] = self._map_run, self._scans[slot]
@@ -291,6 +297,24 @@ class ScanMap:
         self._grid.add(scans, poses)
         self._grid.remove(scans, self._poses[slots])
         self._poses[slots] = poses
+
+
+def together(maps: Sequence[ScanMap]) -> OccupancyMap:
+    """The map of the scans of several maps of one frame, all drawn in coarser cells where it would be too large.
+
+    Raises ``MapTooLarge`` where even the coarsest cells are too many.
+    """
+    resolution_m = max(one.resolution_m for one in maps)
+    while True:
+        for one in maps:
+            if one.resolution_m < resolution_m:
+                one.redraw(resolution_m)
+        try:
+            return maps[0].cells(maps[1:])
+        except MapTooLarge as error:
+            resolution_m *= max(error.coarser, 2.0)
+            if resolution_m > _COARSEST * maps[0].config.resolution_m:
+                raise
 
 
 def warm_up() -> None:

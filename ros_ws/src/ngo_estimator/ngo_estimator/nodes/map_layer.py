@@ -25,7 +25,7 @@ class MapLayer:
     """
 
     def __init__(self, config: ScanMapConfig, frame: str, several: bool) -> None:
-        self.map = ScanMap(config)
+        self.map = ScanMap(config, parts=several)
         self.due = False
         """Whether the map does not follow the trajectory yet."""
         self.stamp_ns = 0

@@ -18,8 +18,8 @@ from ngo_common.nodes.process import StartError, run_node
 from ngo_common.nodes.qos import checked_overrides
 from ngo_common.settings import usage
 from ngo_estimator.mapping.map_files import FREE, OCCUPIED, write_map
-from ngo_estimator.mapping.occupancy_grid import OccupancyMap
-from ngo_estimator.mapping.scan_map import ScanMap, ScanMapConfig, warm_up
+from ngo_estimator.mapping.occupancy_grid import MapTooLarge, OccupancyMap
+from ngo_estimator.mapping.scan_map import ScanMap, ScanMapConfig, together, warm_up
 from ngo_estimator.mapping.scan_source import ScanSource, scan_source
 from ngo_estimator.nodes.inputs import Input, OnDemand
 from ngo_estimator.nodes.listening import Listening
@@ -143,29 +143,36 @@ class NgoMap(Node):
 
     def _draw(self, budget_s: float) -> None:
         with self._status.timed("time an update"):
-            updates = [layer.draw(budget_s / len(self._layers)) for layer in self._layers]
-            if any(update.changed for update in updates):
-                occupancy = self._layers[0].map.config.occupancy
-                trinary = self._cells().trinary(occupancy.free, occupancy.occupied)
-                self._publisher.publish(max(layer.stamp_ns for layer in self._layers), trinary)
-        for layer, update in zip(self._layers, updates, strict=True):
-            if update.restarted:
-                layer.missed = ""
+            first, *others = self._layers
+            updates = [first.draw(budget_s / len(self._layers))]
+            if updates[0].restarted:  # what others saw comes again with their next trajectories in the new map
+                first.missed = ""
                 self.get_logger().info("the trajectory began anew, and so does the map")
+                for layer in others:
+                    layer.map.withdraw()
+            updates += [layer.draw(budget_s / len(self._layers)) for layer in others]
+            if any(update.changed for update in updates):
+                self._publish()
+        for update in updates:
             if update.too_large:
                 self._status.dropped("scans", update.too_large)
 
+    def _publish(self) -> None:
+        occupancy = self._layers[0].map.config.occupancy
+        try:
+            trinary = self._cells().trinary(occupancy.free, occupancy.occupied)
+        except MapTooLarge as error:  # of several robots far from each other
+            self._status.dropped("scans", error)
+            return
+        self._publisher.publish(max(layer.stamp_ns for layer in self._layers), trinary)
+
     def _cells(self) -> OccupancyMap:
         """The whole map, of which all robots' parts have cells of one size."""
-        maps = [layer.map for layer in self._layers]
-        coarsest = max(one.resolution_m for one in maps)
-        for one in maps:
-            if one.resolution_m < coarsest:
-                one.redraw(coarsest)
-        if coarsest > self._said_m:
-            self._said_m = coarsest
+        whole = together([layer.map for layer in self._layers])
+        if whole.resolution_m > self._said_m:
+            self._said_m = whole.resolution_m
             self.get_logger().warning(f"the map is too large for smaller cells: they are {self._said_m:g} m now")
-        return maps[0].cells(maps[1:])
+        return whole
 
     def _on_save(self, request: SaveMap.Request, response: SaveMap.Response) -> SaveMap.Response:
         try:
