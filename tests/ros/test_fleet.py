@@ -8,6 +8,7 @@ import pytest
 from geometry_msgs.msg import PoseWithCovarianceStamped
 from nav_msgs.msg import OccupancyGrid
 from ngo_msgs.msg import RelativePose
+from ngo_msgs.srv import Reset
 from rclpy.qos import DurabilityPolicy, QoSProfile
 from tf2_msgs.msg import TFMessage
 
@@ -43,7 +44,7 @@ def frames(message: TFMessage) -> tuple[str, str]:
     return transform.header.frame_id, transform.child_frame_id
 
 
-def test_robots_that_meet_are_in_one_map_frame_and_on_one_map() -> None:
+def test_robots_that_meet_are_in_one_map_frame_and_on_one_map_until_a_reset() -> None:
     core = Fleet(ScanTrajectory.load(WEIGHTS / "scan", "scan", iterations_per_step=1), NAMES)  # as ngo_node by default
     with Probe() as probe:
         poses = {name: probe.collect(PoseWithCovarianceStamped, f"/{name}/ngo/pose", 1000) for name in NAMES}
@@ -75,3 +76,11 @@ def test_robots_that_meet_are_in_one_map_frame_and_on_one_map() -> None:
             diagnostics.wait_for_value("/ngo_map", "scans that wait for their poses", lambda value: value == "0")
             assert maps[-1].header.frame_id == "map"
             assert int(diagnostics.values("/ngo_map")["scans in the map"]) > 1.5 * k
+            assert probe.set_parameter("/ngo_node", "initial_pose", [5.0, 0.0, 0.0]) == ""
+            assert probe.call(Reset, "ngo_node/reset", Reset.Request()).success
+            first = robots()["red"][k + 1]
+            for step in (first, robots()["red"][k + 2]):
+                steps["red"].publish(relative_pose_message(step, "base_link"))
+            probe.spin_until(lambda: len(poses["red"]) == k + 3, "the poses after the reset")
+            assert poses["red"][k + 1].pose.pose.position.x == pytest.approx(5.0 + first.relative_xyyaw[0], abs=1e-3)
+            diagnostics.wait_for_value("/ngo_map", "scans in the map", lambda value: value == "3")

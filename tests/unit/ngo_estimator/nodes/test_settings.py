@@ -37,9 +37,16 @@ def test_the_file_lists_every_parameter_with_its_default_and_description(name: s
         ({"robots": ["red", "red"]}, "list of different names"),
         ({"robots": ["1st"]}, "list of different names"),
         ({"robots": ["red"], "state": "monday"}, "with a state"),
+        (
+            {"robots": ["red"], "relative_pose_topic": "~/steps"},
+            "'relative_pose_topic' is '~/steps'; allowed: a name without ~",
+        ),
+        ({"robots": ["red"], "trajectory_topic": "~/whole"}, "without ~ in front, with robots"),
     ],
 )
-def test_robots_have_different_names_and_no_saved_state(given: dict[str, object], says: str) -> None:
+def test_robots_have_different_names_topics_in_their_namespaces_and_no_saved_state(
+    given: dict[str, object], says: str
+) -> None:
     for kind in (NgoNodeSettings, MapNodeSettings):
         with pytest.raises(BadParameter, match=says):
             make_settings(kind, given)

@@ -20,7 +20,7 @@ from ngo_estimator.geometry.planar_covariance import position_std
 from ngo_estimator.nodes import messages
 from ngo_estimator.nodes.inputs import Input
 from ngo_estimator.nodes.pose_publisher import PosePublisher
-from ngo_estimator.nodes.settings import NgoNodeSettings, of_robot
+from ngo_estimator.nodes.settings import TOPICS_OF_ROBOTS, NgoNodeSettings, of_robot
 from ngo_estimator.nodes.status import NodeStatus
 from ngo_estimator.nodes.trajectory_publishers import TrajectoryPublishers
 from ngo_estimator.nodes.weights import load_trajectory
@@ -53,8 +53,7 @@ class _Robot:
 
     def own_settings(self, settings: NgoNodeSettings) -> NgoNodeSettings:
         """The settings of a node for this robot alone."""
-        names = ("relative_pose_topic", "pose_topic", "path_topic", "trajectory_topic", "loops_topic")
-        topics: dict[str, Any] = {topic: of_robot(self.name, getattr(settings, topic)) for topic in names}
+        topics: dict[str, Any] = {topic: of_robot(self.name, getattr(settings, topic)) for topic in TOPICS_OF_ROBOTS}
         return replace(settings, robots=(), frame_prefix=f"{self.name}/", **topics)
 
 
@@ -177,8 +176,13 @@ class RobotFleet:
             )
         robot.newest = update
         robot.odom_xyyaw = step.tf_odom_xyyaw if step.tf_odom_known else None
+        if update.begins:  # another odometry has another map -> odom
+            robot.out.smoothing.reset()
         self._send(robot, with_pose=True)
         robot.whole.changed(loops=update.begins)
+        if update.update.optimized:
+            self._on_correction()
+            self._pending.reset()
 
     def _send(self, robot: _Robot, with_pose: bool) -> None:
         """Publish map -> odom of a robot, and its newest pose."""
@@ -229,6 +233,7 @@ class RobotFleet:
 
     def _forget(self) -> None:
         self._fleet.reset()
+        self._origin = type(self._origin).of_first_pose(np.array(self.settings.initial_pose))
         for robot in self._robots.values():
             robot.newest = None
             robot.out.smoothing.reset()
@@ -258,8 +263,12 @@ class RobotFleet:
         if self._fleet.core.fault:
             found.append(f"internal fault, robots go on by odometry: {self._fleet.core.fault}")
         for name, robot in self._robots.items():
-            if robot.newest is not None and robot.newest.map_of is not None:
+            if robot.newest is None:
+                continue
+            if (std_m := position_std(robot.newest.update.covariance)) >= self.settings.lost_position_std_m:
+                found.append(f"{name} is lost: the standard deviation of its position is {std_m:.3g} m")
+            if robot.newest.map_of is not None:
                 found.append(f"{name} is not localised in {self._common}: it is in {robot.out.map_frame}")
-            if robot.newest is not None and robot.odom_xyyaw is None:
+            if robot.odom_xyyaw is None:
                 found.append(f"no map -> odom of {name}: its own odometry is not known at the scans' stamps")
         return found

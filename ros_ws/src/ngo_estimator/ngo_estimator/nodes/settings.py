@@ -34,6 +34,17 @@ def _robots(description: str) -> tuple[str, ...]:
     return names
 
 
+TOPICS_OF_ROBOTS = ("relative_pose_topic", "pose_topic", "path_topic", "trajectory_topic", "loops_topic")
+"""Parameters with topics that each of several robots has in its namespace."""
+
+
+def _check_robots(settings: "NgoNodeSettings | MapNodeSettings") -> None:
+    """Raise ``BadParameter`` about a topic that cannot be in a robot's namespace."""
+    for name in TOPICS_OF_ROBOTS if settings.robots else ():
+        if (value := getattr(settings, name, "")).startswith("~"):
+            raise BadParameter(f"parameter '{name}' is '{value}'; allowed: a name without ~ in front, with robots")
+
+
 def of_robot(robot: str, topic_name: str) -> str:
     """The name of a robot's topic: that of one robot alone, in the robot's namespace."""
     return f"{robot}/{topic_name.removeprefix('/')}"
@@ -265,6 +276,7 @@ class NgoNodeSettings(EstimatorSettings):
         super().__post_init__()
         if self.map_frame == self.odom_frame:
             raise BadParameter(f"parameter 'map_frame' is {self.map_frame!r}; allowed: another name than odom_frame's")
+        _check_robots(self)
         if self.robots and (self.mode != "mapping" or self.state):
             raise BadParameter(
                 f"parameter 'robots' is {list(self.robots)}; allowed: none with mode localization, or with a state"
@@ -311,5 +323,6 @@ class MapNodeSettings(StepSettings):
 
     def __post_init__(self) -> None:
         super().__post_init__()
+        _check_robots(self)
         if self.robots and self.state:
             raise BadParameter(f"parameter 'robots' is {list(self.robots)}; allowed: none with a state")
