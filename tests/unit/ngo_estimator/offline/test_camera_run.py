@@ -14,8 +14,12 @@ from ngo_estimator.frontend.camera.picture_odometry import PictureOdometry
 from ngo_estimator.geometry import se2
 from ngo_estimator.geometry.camera_model import CameraModel
 from ngo_estimator.nodes.run_recording import Arguments, run
+from ngo_estimator.offline.camera_run import CameraRun
+from ngo_estimator.offline.recorded import RecordedRun, RecordedStep
 from ngo_estimator.slam.picture_trajectory import PictureTrajectory
 from ngo_estimator.trajectory.files import read_tum
+from ngo_recordings.frames import Frame
+from ngo_recordings.scan_stream import WheelPose
 from ngo_recordings.topics import TopicArguments
 from tests.unit.ngo_estimator.rendered_room import by_wheels, camera, drive, picture, rays_of
 from tests.unit.ngo_recordings import messages as m
@@ -96,6 +100,29 @@ def test_a_saved_trajectory_goes_on_as_the_one_that_was_saved() -> None:
     other = PictureTrajectory().restored(online.state())
     for step in steps[25:]:
         np.testing.assert_array_equal(online.update(step).pose_xyyaw, other.update(step).pose_xyyaw)
+
+
+def test_each_part_of_a_recording_whose_stamps_jump_back_has_wheels_of_its_own() -> None:
+    black, late = np.zeros((120, 160, 1), np.uint8), WheelPose(0, np.zeros(3))
+    first, second = (
+        [WheelPose(k * PERIOD_NS, np.array((at_m + 0.01 * k, 0.0, 0.0))) for k in range(20)] for at_m in (0.0, 100.0)
+    )
+    run = CameraRun(PictureOdometry(camera(160)), PictureTrajectory())
+    frames = [Frame(k * PERIOD_NS, black) for _ in range(2) for k in range(15)]
+    events = list(run.run(frames, [*first[:15], late, *first[15:], *second]))
+    steps = [event.local for event in events if isinstance(event, RecordedStep)]
+    at_m = [float(step.tf_odom_xyyaw[0]) for step in steps]
+    np.testing.assert_allclose(at_m, [base + 0.01 * k for base in (0.0, 100.0) for k in range(1, 15)], atol=1e-9)
+    assert sum(isinstance(event, RecordedRun) for event in events) == 2
+    assert run.remarks() == ["28 of 28 pictures told too little: the robot's odometry alone counts there"]
+
+
+def test_a_clock_that_is_wrong_is_said_in_one_line() -> None:
+    frames = [Frame(30_000_000_000 + k * PERIOD_NS, np.zeros((120, 160, 1), np.uint8)) for k in range(5)]
+    run = CameraRun(PictureOdometry(camera(160)), PictureTrajectory())
+    assert not list(run.run(frames, [WheelPose(k * PERIOD_NS, np.zeros(3)) for k in range(5)]))
+    assert run.rejected == {"no odometry at their stamps": 5}
+    assert run.examples.popitem()[1] == "newest stamp of pictures 30.400 s, of odometry 0.400 s"
 
 
 @pytest.mark.parametrize(

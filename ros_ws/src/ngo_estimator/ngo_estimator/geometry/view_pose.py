@@ -142,17 +142,20 @@ def triangulated(points: RangedRays, seen: Array, pose: Array, centre: Array, in
     return inverse
 
 
-def measured_ranges(points: RangedRays, seen: Array, std_rad: Array, pose: Array, centre: Array) -> tuple[Array, Array]:
+def measured_ranges(
+    points: RangedRays, seen: Array, std_rad: Array, pose: Array, centre: Array, unknown_m: float = 0.0
+) -> tuple[Array, Array]:
     """Inverse ranges ``(n,)`` by both pictures together, and deviations ``(n,)``; see ``fit_view`` for what is given.
 
     A range is triangulated from the old ray to a point and the new one, and averaged with what is known of it. The way
-    between the pictures is not known better than the motion that was given.
+    between the pictures is not known better than the motion that was given, which may leave ``unknown_m`` of it open.
     """
     fresh = triangulated(points, seen, pose, centre, points.inverse, _TRIANGULATIONS)
     errors, _, by_inverse = ray_errors(replace(points, inverse=fresh), seen, pose, centre)
     slope = np.maximum((by_inverse**2).sum(1), _NO_SLOPE)
     way = np.maximum(np.linalg.norm(points.origins - camera_at(pose, centre), axis=1), 1e-6)
-    std = np.hypot(1.5 * std_rad / np.sqrt(slope), fresh * np.hypot(_WAY_STD_M / way, _WAY_STD_SHARE))
+    way_std = np.hypot(np.hypot(_WAY_STD_M, unknown_m) / way, _WAY_STD_SHARE)
+    std = np.hypot(1.5 * std_rad / np.sqrt(slope), fresh * way_std)
     meets = np.linalg.norm(errors, axis=1) < _MISSED * std_rad
     std = np.where((way > _LEAST_WAY_M) & meets, std, UNKNOWN_STD)
     old, new = points.inverse_std**-2.0, std**-2.0

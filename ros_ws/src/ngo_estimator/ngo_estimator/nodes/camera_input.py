@@ -62,7 +62,8 @@ class CameraInput:
         self._mounted = False  # as transforms say
         self._held: deque[tuple[int, np.ndarray]] = deque(maxlen=_MOST_HELD)
         self._given: deque[tuple[int, np.ndarray]] = deque(maxlen=_DEPTH)  # odometry before there is a core
-        self._restarts = self._newly_alone = 0
+        self._restarts = self._newly_alone = self._unplaced = self._jumps = 0
+        self._newly_unplaced = self._newly_jumped = 0
 
     @property
     def description(self) -> str:
@@ -172,6 +173,11 @@ class CameraInput:
         for step in self._core.ready():
             self._publish(step)
         self._newly_alone += self._core.by_wheels - alone
+        if unplaced := self._core.unplaced - self._unplaced:
+            self._status.dropped("picture", f"no odometry at its stamp ({self._core.clocks})", unplaced)
+            self._newly_unplaced += unplaced
+        self._newly_jumped += self._core.jumps - self._jumps
+        self._unplaced, self._jumps = self._core.unplaced, self._core.jumps
 
     def _made_core(self) -> bool:
         """Whether calibration and mounting are known by now, or the mounting has been waited for long enough."""
@@ -195,7 +201,7 @@ class CameraInput:
             self._held.clear()
             self._status.dropped("calibration", error)
             return False
-        self._mounted, self._restarts = mounting is not None, 0
+        self._mounted, self._restarts, self._unplaced, self._jumps = mounting is not None, 0, 0, 0
         logger.info(f"camera: {model.width} x {model.height}, {model.description}, '{frame}' on '{self._base_frame}'")
         for stamp_ns, pose in self._given:
             self._add_wheels(stamp_ns, pose)
@@ -233,6 +239,12 @@ class CameraInput:
         if self._newly_alone:
             found.append(f"{self._newly_alone} pictures told too little: the robot's odometry alone counts there")
             self._newly_alone = 0
+        if self._newly_jumped:
+            found.append(f"the robot's odometry jumped {self._newly_jumped} times: the motion is guessed there")
+            self._newly_jumped = 0
+        if self._newly_unplaced and self._core is not None and self._core.has_wheels:
+            found.append(f"{self._newly_unplaced} pictures had no odometry at their stamps ({self._core.clocks})")
+        self._newly_unplaced = 0
         if self._calibration is None and self._held:
             found.append(f"no CameraInfo came on {' or '.join(self._info_topics)}, without which pictures are not used")
         if not self._given and (self._core is None or not self._core.has_wheels):

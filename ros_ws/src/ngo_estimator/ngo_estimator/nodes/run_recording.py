@@ -371,7 +371,7 @@ def _camera(arguments: Arguments, recording: Recording, console: Console) -> "St
         f"camera: {seen.width} x {seen.height}, {model.description}; {where}", soft_wrap=True, highlight=False
     )
     core = CameraRun(odometry, PictureTrajectory(iterations_per_step=arguments.iterations_per_step))
-    wheels = sorted(wheel_poses(recording, topics, core.rejected), key=lambda each: each.stamp_ns)
+    wheels = wheel_poses(recording, topics, core.rejected)
     frames = frames_of(recording, topics, core.rejected, (seen.height, seen.width))
     return CAMERA_WORLD, topics, core, core.run(frames, wheels)
 

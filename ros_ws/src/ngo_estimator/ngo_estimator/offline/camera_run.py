@@ -4,6 +4,7 @@ from collections import Counter
 from collections.abc import Iterable, Iterator
 from typing import Any
 
+from ngo_estimator.data.relative_step import RESTART_AFTER_NS
 from ngo_estimator.frontend.camera.picture_odometry import PictureOdometry
 from ngo_estimator.frontend.rejected_frames import DuplicateFrame, LateFrame
 from ngo_estimator.offline.recorded import RecordedRun, RecordedStep, Truth
@@ -17,6 +18,7 @@ _REASONS: dict[type[ValueError], str] = {
     DuplicateFrame: "the stamp came twice",
     LateFrame: "older than the picture before",
 }
+_UNPLACED = "no odometry at their stamps"
 _AHEAD_NS = 500_000_000
 """Odometry is given so far ahead of a picture."""
 
@@ -58,6 +60,8 @@ class CameraRun:
             lines.append(
                 f"{self._by_wheels} of {self._steps} pictures told too little: the robot's odometry alone counts there"
             )
+        if self._odometry.jumps:
+            lines.append(f"the robot's odometry jumped {self._odometry.jumps} times: the motion is guessed there")
         if self.faults:
             lines.append(f"{len(self.faults)} faults, where it went on by odometry (first: {self.faults[0]})")
         return lines
@@ -66,17 +70,26 @@ class CameraRun:
         """Every step, and after the last one of a trajectory the whole of it.
 
         A recording whose stamps jump back by a second or more holds several trajectories.
+
+        Args:
+            wheels: in the order in which they were recorded.
         """
         self._odometry.reset()
         self._online.reset()
-        truth, poses = Truth(), iter(wheels)
-        pose = next(poses, None)
+        pieces = iter(_pieces(wheels))
+        truth, poses = Truth(), iter(next(pieces, ()))
+        pose, newest_ns = next(poses, None), 0
         for frame in frames:
             self.frames += 1
+            if frame.stamp_ns <= newest_ns - RESTART_AFTER_NS:
+                yield from self._ready(at_end=True)
+                yield from self._finished(truth)
+                self._odometry.reset()
+                truth, poses = Truth(), iter(next(pieces, ()))
+                pose, newest_ns = next(poses, None), frame.stamp_ns
             while pose is not None and pose.stamp_ns <= frame.stamp_ns + _AHEAD_NS:
                 self._take_wheels(pose)
                 pose = next(poses, None)
-            restarts = self._odometry.restarts
             try:
                 self._odometry.add_picture(frame.stamp_ns, frame.image)
             except ValueError as error:
@@ -84,9 +97,7 @@ class CameraRun:
                 self.rejected[reason] += 1
                 self.examples.setdefault(reason, f"{seconds(frame.stamp_ns)} s: {error}")
                 continue
-            if self._odometry.restarts != restarts:
-                yield from self._finished(truth)
-                truth = Truth()
+            newest_ns = frame.stamp_ns
             truth.add(frame)
             yield from self._ready(at_end=False)
         yield from self._ready(at_end=True)
@@ -100,6 +111,12 @@ class CameraRun:
             self.examples.setdefault("odometry not usable", f"{seconds(pose.stamp_ns)} s: {error}")
 
     def _ready(self, at_end: bool) -> Iterator[RecordedStep]:
+        yield from self._steps_of(at_end)
+        if unplaced := self._odometry.unplaced - self.rejected[_UNPLACED]:
+            self.rejected[_UNPLACED] += unplaced
+            self.examples.setdefault(_UNPLACED, self._odometry.clocks)
+
+    def _steps_of(self, at_end: bool) -> Iterator[RecordedStep]:
         for step in self._odometry.ready(at_end):
             update = self._online.update(step)
             self.gaps += update.gap
@@ -118,3 +135,17 @@ class CameraRun:
         self._online.reset()
         if trajectory is not None and graph is not None:
             yield RecordedRun(trajectory, graph, *truth.poses())
+
+
+def _pieces(wheels: Iterable[WheelPose]) -> list[list[WheelPose]]:
+    """The poses between two jumps back of their stamps, each piece sorted; a single pose that comes late is no jump."""
+    recorded = list(wheels)
+    pieces: list[list[WheelPose]] = [[]]
+    newest_ns = 0
+    for pose, following in zip(recorded, [*recorded[1:], None], strict=True):
+        both_ns = max(pose.stamp_ns, pose.stamp_ns if following is None else following.stamp_ns)
+        if pieces[-1] and both_ns <= newest_ns - RESTART_AFTER_NS:
+            pieces.append([])
+        newest_ns = max(newest_ns, pose.stamp_ns) if pieces[-1] else pose.stamp_ns
+        pieces[-1].append(pose)
+    return [sorted(piece, key=lambda each: each.stamp_ns) for piece in pieces]

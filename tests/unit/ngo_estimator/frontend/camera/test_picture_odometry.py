@@ -1,9 +1,13 @@
 """Odometry of pictures where they, or the wheels, tell nothing."""
 
+import math
+
 import numpy as np
 import pytest
 
+from ngo_estimator.data.relative_step import RelativeStep
 from ngo_estimator.frontend.camera.picture_odometry import PictureOdometry
+from ngo_estimator.geometry.planar_motion import between
 from tests.unit.ngo_estimator.rendered_room import by_wheels, camera, drive, picture, rays_of
 
 PERIOD_NS = 100_000_000
@@ -23,3 +27,58 @@ def test_black_pictures_go_on_by_wheels(black: range) -> None:
         inliers.append(odometry.inliers)
     assert not any(inliers[k] for k in black) and inliers[-1] > 20
     assert odometry.by_wheels == len([k for k in range(1, 10) if k in black or k - 1 in black])
+
+
+def dark(times_s: np.ndarray, wheels: list[tuple[float, np.ndarray]]) -> tuple[PictureOdometry, list[RelativeStep]]:
+    """Steps in the dark with poses of the wheels by their stamps (s)."""
+    odometry, steps = PictureOdometry(camera(160)), list[RelativeStep]()
+    waiting = iter([*wheels, (math.inf, np.zeros(3))])
+    stamp_s, pose = next(waiting)
+    for time_s in times_s.tolist():
+        while stamp_s <= time_s + 1e-6:
+            odometry.add_wheels(round(stamp_s * 1e9), pose)
+            stamp_s, pose = next(waiting)
+        odometry.add_picture(round(time_s * 1e9), np.zeros((120, 160, 1), np.uint8))
+        steps += odometry.ready()
+    return odometry, steps
+
+
+def test_nobody_is_sure_of_the_way_while_the_wheels_are_silent() -> None:
+    def on_half_circle(time_s: float) -> np.ndarray:
+        angle = np.pi * np.clip((time_s - 2.0) / 10.0, 0.0, 1.0)
+        return np.array((np.sin(angle), 1.0 - np.cos(angle), angle))
+
+    times_s = np.arange(0.0, 14.0, 0.1)
+    heard = [(t, on_half_circle(t)) for t in times_s.tolist() if not 2.1 < t < 11.9]
+    odometry, steps = dark(times_s, heard)
+    gap_variance = 0.0
+    for step in steps:
+        begin, end = step.from_stamp_ns * 1e-9, step.stamp_ns * 1e-9
+        off = step.relative_xyyaw - between(on_half_circle(begin), on_half_circle(end))
+        assert off @ np.linalg.solve(step.covariance, off) < 9.0
+        if begin > 1.9 and end < 12.1:
+            gap_variance += step.covariance[0, 0]
+        else:
+            assert step.covariance[0, 0] < 0.01**2
+    assert 4.0 < math.sqrt(gap_variance) < 6.0  # m/s for half of the gap, whatever the rate of the pictures
+    assert odometry.unplaced == len(times_s) - len(steps) - 1 > 0  # more pictures than may wait
+
+
+def test_wheels_that_start_again_elsewhere_are_not_believed() -> None:
+    times_s = np.arange(0.0, 2.0, 0.1)
+    wheels = [(t, np.array((0.3 * t + (10.0 if t < 1.0 else 0.0), 5.0 if t < 1.0 else 0.0, 0.0))) for t in times_s]
+    odometry, steps = dark(times_s, wheels)
+    assert odometry.jumps == 1
+    assert steps[-1].odom_xyyaw == pytest.approx((0.3 * 1.9, 0.0, 0.0), abs=1e-6)
+    open_m = [math.sqrt(step.covariance[0, 0]) for step in steps]
+    assert np.argmax(open_m) == 9 and open_m[9] > 0.1 > 10.0 * open_m[8]
+
+
+def test_a_clock_that_is_wrong_is_told_by_the_stamps() -> None:
+    times_s = np.arange(0.0, 10.0, 0.1)
+    for ahead_s in (30.0, -30.0):
+        odometry, steps = dark(times_s + 100.0 + ahead_s, [(100.0 + t, np.zeros(3)) for t in times_s.tolist()])
+        steps += odometry.ready(at_end=True)
+        assert not steps and odometry.unplaced == 100
+        newest = f"{109.9:.3f} s" if ahead_s > 0.0 else "none"
+        assert odometry.clocks == f"newest stamp of pictures {109.9 + ahead_s:.3f} s, of odometry {newest}"

@@ -37,6 +37,16 @@ def test_wheels_that_fell_silent_tell_nothing() -> None:
     assert wheels.motion(1.0, 2.6, np.eye(3)) is None and wheels.paused(1.0, 4.0, 1.5)
 
 
+def test_gaps_that_reach_into_a_time_are_told_with_their_share_of_it() -> None:
+    wheels = StampedWheels()
+    for stamp_s in (0.0, 0.1, 2.1, 2.2, 3.2):
+        wheels.add(round(stamp_s * 1e9), np.zeros(3))
+    lengths_s, inside_s = wheels.gaps(1.1, 2.7, 0.5)
+    np.testing.assert_allclose(lengths_s, (2.0, 1.0))
+    np.testing.assert_allclose(inside_s, (1.0, 0.5))
+    assert len(wheels.gaps(0.0, 0.1, 0.5)[0]) == 0 and wheels.gaps(3.2, 4.0, 0.5)[0] == pytest.approx(0.8)
+
+
 def test_the_lag_is_learned_from_turns() -> None:
     """Scans that are 0.1 s older than their stamps turned when the wheels had turned 0.1 s before."""
     wheels = StampedWheels()

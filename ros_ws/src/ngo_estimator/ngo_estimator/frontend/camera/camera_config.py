@@ -20,6 +20,15 @@ class CameraConfig:
     given_rad: float = 0.01
     # Turn that the given motion may miss, rad for each m.
     given_rad_per_m: float = 0.05
+    # Silence of the odometry (s) beyond which its straight line through the gap counts as a guess.
+    silent_s: float = 0.25
+    # Deviations of speed (m/s, rad/s) and acceleration (m/s^2, rad/s^2) where nobody knows them.
+    unknown_speed: tuple[float, float] = (1.0, 1.0)
+    unknown_acceleration: tuple[float, float] = (1.0, 2.0)
+    # Speeds (m/s, rad/s) beyond which the given motion is a jump of its frame, and the least time they are taken over
+    # (s): robots on floors are slower by far, and a driver that starts again is farther away.
+    fastest: tuple[float, float] = (10.0, 10.0)
+    least_s: float = 0.03
     # Deviation of the share by which all ranges are wrong together.
     scale_std: float = 0.1
     # Standard deviation of how much higher or lower the camera comes to be: a share of the way, and besides (m).

@@ -49,6 +49,8 @@ class PictureOdometry:
         self._odometry = TrackedOdometry(model, self._config)
         self.restarts = 0
         """How often stamps jumped back, so that the odometry began anew."""
+        self.unplaced = self.jumps = 0
+        """Pictures at whose stamps there was no odometry, and motions of it that no robot makes; neither is used."""
         self.reset()
 
     def reset(self) -> None:
@@ -60,6 +62,7 @@ class PictureOdometry:
         self._newest_ns: int | None = None
         self._origin_ns = 0
         self._given = np.zeros(3)  # the wheels' pose at the last picture
+        self._velocity = np.zeros(3)  # the last one that was given and believed, in base axes
         self._key_pose = np.zeros(3)
         self._origin_code: np.ndarray | None = None
         self.has_wheels = False
@@ -71,6 +74,8 @@ class PictureOdometry:
         """Take a pose ``(3,)`` of the robot's odometry, in its own frame."""
         if not np.isfinite(pose_xyyaw).all():
             raise ValueError("robot odometry has values that are not finite")
+        if stamp_ns <= self._wheels.newest_ns - RESTART_AFTER_NS:
+            self._wheels = StampedWheels()
         self.has_wheels = True
         self._wheels.add(stamp_ns, pose_xyyaw)
 
@@ -82,8 +87,12 @@ class PictureOdometry:
         """
         if self._newest_ns is not None and stamp_ns <= self._newest_ns:
             if stamp_ns <= self._newest_ns - RESTART_AFTER_NS:
+                self.unplaced += len(self._waiting)
+                wheels, had_wheels = self._wheels, self.has_wheels
                 self.reset()
                 self.restarts += 1
+                if wheels.newest_ns < stamp_ns + RESTART_AFTER_NS:  # of the new run already
+                    self._wheels, self.has_wheels = wheels, had_wheels
             else:
                 kind = DuplicateFrame if stamp_ns == self._newest_ns else LateFrame
                 raise kind(f"picture of {stamp_ns} ns came after one of {self._newest_ns} ns")
@@ -96,6 +105,7 @@ class PictureOdometry:
         self._newest_ns = stamp_ns
         if len(self._waiting) == _MOST_WAITING:
             self._waiting.popleft()
+            self.unplaced += 1
         self._waiting.append((stamp_ns, _grey(picture)))
 
     @property
@@ -112,16 +122,26 @@ class PictureOdometry:
         """The steps of pictures whose odometry is known; at the end, of all that lie within it."""
         while self._waiting:
             stamp_ns, grey = self._waiting[0]
-            if not self.has_wheels or (self._wheels.newest_ns < stamp_ns and not at_end):
+            if not at_end and (not self.has_wheels or self._wheels.newest_ns < stamp_ns):
                 return
             self._waiting.popleft()
             given = self._wheels.pose_at(stamp_ns * 1e-9)
-            if given is not None and (step := self._step(stamp_ns, grey, given)) is not None:
+            if given is None:
+                self.unplaced += 1
+            elif (step := self._step(stamp_ns, grey, given)) is not None:
                 yield step
+
+    @property
+    def clocks(self) -> str:
+        """The newest stamps of pictures and odometry, in words."""
+        odometry = f"{self._wheels.newest_ns * 1e-9:.3f} s" if self.has_wheels else "none"
+        picture = "none" if self._newest_ns is None else f"{self._newest_ns * 1e-9:.3f} s"
+        return f"newest stamp of pictures {picture}, of odometry {odometry}"
 
     def _step(self, stamp_ns: int, grey: Grey, given: np.ndarray) -> RelativeStep | None:
         odometry, last_ns = self._odometry, self._last_ns
-        relative, covariance = odometry.add(grey, between(self._given, given))
+        motion, unknown = self._motion(last_ns, stamp_ns, given)
+        relative, covariance = odometry.add(grey, motion, unknown)
         self._last_ns, self._given = stamp_ns, given
         if last_ns is None:
             self._origin_ns, self._origin_code = stamp_ns, self._key_code(grey)
@@ -135,6 +155,25 @@ class PictureOdometry:
             stamp_ns, last_ns, relative, covariance, self._origin_ns, odometry.pose.copy(), _NOTHING,
             self._key_code(grey) if is_key else _NOTHING, from_place_code=origin, robot_odom_xyyaw=given.copy(),
         )  # fmt: skip
+
+    def _motion(self, last_ns: int | None, stamp_ns: int, given: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """The motion ``(3,)`` to a picture by the wheels, whose pose is ``given`` there, and variances ``(3,)`` of what
+        they leave open of it (m, m, rad): the way in a gap between readings, and all of it where their frame jumped."""
+        motion, config = between(self._given, given), self._config
+        if last_ns is None:
+            return motion, np.zeros(3)
+        took_s = (stamp_ns - last_ns) * 1e-9
+        speeds = np.array((math.hypot(motion[0], motion[1]), abs(motion[2]))) / max(took_s, config.least_s)
+        speed, acceleration = np.array(config.unknown_speed), np.array(config.unknown_acceleration)
+        if (speeds > config.fastest).any():
+            self.jumps += 1
+            return self._velocity * took_s, (speed * took_s)[[0, 0, 1]] ** 2
+        self._velocity = motion / took_s
+        # Between two readings the way strays from the line between them by so much, and by no more than the robot goes.
+        lengths_s, inside_s = self._wheels.gaps(last_ns * 1e-9, stamp_ns * 1e-9, config.silent_s)
+        strays = np.minimum(acceleration * lengths_s[:, None] ** 2 / 8.0, speed * lengths_s[:, None] / 2.0)
+        variances: np.ndarray = (strays**2 * (inside_s / lengths_s)[:, None]).sum(0)[[0, 0, 1]]
+        return motion, variances
 
     def _key_code(self, grey: Grey) -> np.ndarray:
         self._key_pose = self._odometry.pose.copy()

@@ -72,10 +72,14 @@ class TrackedOdometry:
         self._from_rays = self._model.rays(self._pixels)
         self._given = np.zeros(3)  # since then
         self._way = self._turn = self._frames = 0.0
+        self._unknown = np.zeros(3)
         self._covariance = np.zeros((3, 3))
 
-    def add(self, grey: Grey, given: Array) -> tuple[Array, Array]:
+    def add(self, grey: Grey, given: Array, unknown: Array) -> tuple[Array, Array]:
         """Take the next picture and the motion ``(3,)`` that led to it, as it was given.
+
+        Args:
+            unknown: variances ``(3,)`` of what is open of that motion besides what the settings say (m, m, rad).
 
         Returns:
             The motion ``(3,)`` as it is estimated, and its covariance ``(3, 3)``.
@@ -90,6 +94,7 @@ class TrackedOdometry:
         self._way += math.hypot(given[0], given[1])
         self._turn += abs(given[2])
         self._frames += 1
+        self._unknown = self._unknown + unknown
         self._follow(grey, compose(before, given))
         fitted = self._fit(compose(before, given))
         self._take(fitted)
@@ -120,7 +125,7 @@ class TrackedOdometry:
         config = self._config
         along = (config.given_way_share * self._way) ** 2 + self._frames * config.given_m**2
         turn = (config.given_turn_share * self._turn) ** 2 + (config.given_rad_per_m * self._way) ** 2
-        covariance = np.diag((along, along, turn + self._frames * config.given_rad**2))
+        covariance = np.diag((along, along, turn + self._frames * config.given_rad**2) + self._unknown)
         return compose(self._from, self._given), covariance
 
     @property
@@ -207,7 +212,8 @@ class TrackedOdometry:
             return
         points, here = self._points, camera_at(fitted.pose, self._centre_now)
         scaled = replace(points, inverse=points.inverse * (1.0 + fitted.scale))
-        inverse, std = measured_ranges(scaled, self._seen, self._std_rad, fitted.pose, self._centre_now)
+        unknown_m = math.sqrt(np.trace(fitted.covariance[:2, :2])) if self._unknown.any() else 0.0
+        inverse, std = measured_ranges(scaled, self._seen, self._std_rad, fitted.pose, self._centre_now, unknown_m)
         # From now on they are seen from here.
         vectors = points.rays + inverse[:, None] * (points.origins - here)
         nearer = 1.0 / np.maximum(np.linalg.norm(vectors, axis=1), _NEAREST)

@@ -93,6 +93,18 @@ class StampedWheels:
         ends = np.concatenate(([from_s - origin_s], inside, [to_s - origin_s]))
         return bool(np.diff(ends).max() > longest_s)
 
+    def gaps(self, from_s: float, to_s: float, longest_s: float) -> tuple[Array, Array]:
+        """The gaps between readings, of more than ``longest_s``, that reach into the time between two stamps (s since
+        the epoch): their lengths ``(n,)``, and how much of each lies within that time ``(n,)``, s."""
+        rows = self._rows[: self._count, 0]
+        begin_s, end_s = (stamp_s - self._origin_ns * 1e-9 for stamp_s in (from_s, to_s))
+        first = int(np.searchsorted(rows, begin_s, side="right")) - 1
+        near = rows[max(first, 0) : int(np.searchsorted(rows, end_s)) + 1]
+        edges = np.concatenate(([min(begin_s, near[0])], near, [max(end_s, near[-1])]))
+        lengths, inside = np.diff(edges), np.minimum(edges[1:], end_s) - np.maximum(edges[:-1], begin_s)
+        long = (lengths > longest_s) & (inside > 0.0)
+        return lengths[long], inside[long]
+
     def observe_turn(self, from_s: float, to_s: float, turn_rad: float) -> None:
         """Take how far the robot turned between two scans, by a match, to learn the lag."""
         self._pending.append((from_s - self._origin_ns * 1e-9, to_s - self._origin_ns * 1e-9, turn_rad))
