@@ -1,5 +1,7 @@
 """Two views of a planar motion: exact where points are exact, with pitch, lever arm and distortion."""
 
+import math
+
 import numpy as np
 import pytest
 
@@ -91,6 +93,10 @@ def test_known_ranges_tell_the_scale_and_unknown_ones_leave_it_to_the_prior() ->
 def test_a_frame_whose_z_is_up_is_the_cameras_body() -> None:
     np.testing.assert_array_equal(camera_mounting(np.zeros(3), np.eye(3))[:, :3], LOOKING_AHEAD)
     np.testing.assert_array_equal(camera_mounting(np.zeros(3), LOOKING_AHEAD)[:, :3], LOOKING_AHEAD)
+    down = tilted(math.radians(30.0), 0.0)[:, :3]
+    np.testing.assert_allclose(camera_mounting(np.zeros(3), down @ LOOKING_AHEAD.T)[:, :3], down)
+    up = tilted(math.radians(-60.0), 0.0)[:, :3]
+    np.testing.assert_array_equal(camera_mounting(np.zeros(3), up, optical=True)[:, :3], up)
 
 
 @pytest.mark.parametrize(

@@ -13,7 +13,9 @@ DISTORTIONS = {"plumb_bob": (4, 5), "rational_polynomial": (8,), "equidistant": 
 LOOKING_AHEAD = np.array(((0.0, 0.0, 1.0), (-1.0, 0.0, 0.0), (0.0, -1.0, 0.0)))
 """Axes of an optical frame (z ahead, x right, y down) in a base frame (x ahead, y left, z up), looking ahead."""
 
-_UP = 0.9
+_UP = 0.71
+"""Of an axis within 45 degrees from straight up."""
+
 _UNDISTORTED = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 40, 1e-10)
 
 
@@ -118,11 +120,11 @@ def tilted(pitch_rad: float, height_m: float, forward_m: float = 0.0) -> Array:
     return np.column_stack((down @ LOOKING_AHEAD, (forward_m, 0.0, height_m)))
 
 
-def camera_mounting(position: Array, axes: Array) -> Array:
+def camera_mounting(position: Array, axes: Array, optical: bool = False) -> Array:
     """``base_from_camera`` ``(3, 4)`` of a camera's frame with this ``position`` ``(3,)`` and ``axes`` ``(3, 3)``.
 
     Pictures are of an optical frame, whose z looks ahead. Drivers that stamp them with the camera's body, whose z is
-    up, are understood: no camera of a robot looks straight up.
+    up, are understood: no camera of a robot looks straight up. One that looks up steeply needs to be ``optical``.
     """
-    body = axes[2, 2] > _UP
+    body = not optical and axes[2, 2] > _UP
     return np.column_stack((axes @ LOOKING_AHEAD if body else axes, position))

@@ -363,6 +363,7 @@ def _camera(arguments: Arguments, recording: Recording, console: Console) -> "St
         pose, where = None, f"no transform says where it sits: {NOT_MOUNTED}"
     else:
         base, frame, pose, source = mounted
+        seen = replace(seen, frame_id=frame)
         where = f"{frame} in {base} at {', '.join(f'{value:.3f}' for value in pose.position)} m (from {source})"
     model = calibrated_camera(seen, pose)
     odometry = PictureOdometry(model)
