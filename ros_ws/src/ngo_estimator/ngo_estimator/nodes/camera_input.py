@@ -2,6 +2,8 @@
 
 from collections import deque
 from collections.abc import Callable
+from dataclasses import replace
+from functools import partial
 from typing import Any
 
 import cv2
@@ -9,6 +11,7 @@ import numpy as np
 from nav_msgs.msg import Odometry
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+from scipy.spatial.transform import Rotation
 from sensor_msgs.msg import CameraInfo, CompressedImage, Image
 from tf2_msgs.msg import TFMessage
 
@@ -58,6 +61,8 @@ class CameraInput:
         self._is_compressed = settings.image_transport == "compressed"
         self._topic = settings.image_topic + ("/compressed" if self._is_compressed else "")
         self._calibration: Calibration | None = None
+        self._said: tuple[Any, ...] | None = None  # by the CameraInfo that counts, and its topic
+        self._picture_frame = ""
         self._core: PictureOdometry | None = None
         self._mounted = False  # as transforms say
         self._held: deque[tuple[int, np.ndarray]] = deque(maxlen=_MOST_HELD)
@@ -85,7 +90,7 @@ class CameraInput:
         pictures = QoSProfile(depth=settings.image_depth, reliability=reliability)
         listening.to(CompressedImage if self._is_compressed else Image, self._topic, self._on_picture, pictures)
         for topic in self._info_topics:
-            listening.to_all(CameraInfo, topic, self._on_info, pictures)
+            listening.to_all(CameraInfo, topic, partial(self._on_info, topic), pictures)
         if settings.robot_odometry == "topic":
             listening.to(Odometry, settings.robot_odometry_topic, self._on_odometry, QoSProfile(depth=_DEPTH))
         # Every node on a robot publishes transforms: no single publisher is held on to.
@@ -93,16 +98,26 @@ class CameraInput:
         latched = QoSProfile(depth=_DEPTH, durability=DurabilityPolicy.TRANSIENT_LOCAL)
         listening.to_all(TFMessage, settings.tf_topic + "_static", self._on_static, latched)
 
-    def _on_info(self, message: CameraInfo) -> None:
-        if self._calibration is not None:
+    def _on_info(self, topic: str, message: CameraInfo) -> None:
+        arrays = (np.asarray(values, np.float64).tobytes() for values in (message.k, message.p, message.d))
+        size = message.height, message.width
+        said = topic, *size, message.distortion_model, message.header.frame_id, *arrays
+        if said == self._said or (self._said is not None and self._said[0] != topic):
             return
-        topic = " or ".join(self._info_topics)
         try:
             self._calibration = calibration_of(message, topic, self._node.resolve_topic_name(self._topic))
         except ValueError as error:
             self._status.dropped("calibration", error)
             return
+        self._said = said
+        if self._core is not None:
+            self._begin_anew("the calibration changed")
         self._update()
+
+    def _begin_anew(self, why: str) -> None:
+        self._core = None
+        self._publish(None)
+        self._node.get_logger().warning(f"{why}: the odometry starts anew with it")
 
     def _on_static(self, message: TFMessage) -> None:
         self._take_transforms(message, static=True)
@@ -118,9 +133,7 @@ class CameraInput:
         if self._wheels.bad > bad and self._settings.robot_odometry == "tf":
             self._status.dropped("robot odometry", _NO_POSE)
         if self._core is not None and not self._mounted and self._mounting() is not None:
-            self._core = None
-            self._publish(None)
-            self._node.get_logger().warning("the camera's mounting came late: the odometry starts anew with it")
+            self._begin_anew("the camera's mounting came late")
         self._update()
 
     def _on_odometry(self, message: Odometry) -> None:
@@ -152,6 +165,7 @@ class CameraInput:
             self._status.dropped("picture", error)
             return
         stamp_ns = messages.to_ns(message.header.stamp)
+        self._picture_frame = message.header.frame_id.strip("/")
         self._status.received(stamp_ns)
         self._held.append((stamp_ns, pixels))
         self._update()
@@ -187,17 +201,17 @@ class CameraInput:
         waited_ns = self._held[-1][0] - self._held[0][0]
         if mounting is None and waited_ns < _MOUNTING_WAIT_NS and len(self._held) < _MOST_HELD:
             return False
-        frame, logger = self._calibration.frame_id, self._node.get_logger()
+        frame, logger = self._frame, self._node.get_logger()
         if mounting is None:
             logger.warning(
                 f"{self._settings.tf_topic}_static does not say where '{frame}' sits on '{self._base_frame}': "
                 f"{NOT_MOUNTED}"
             )
         try:
-            model = calibrated_camera(self._calibration, mounting)
+            model = calibrated_camera(replace(self._calibration, frame_id=frame), mounting)
             self._core = PictureOdometry(model)
         except ValueError as error:
-            self._calibration = None
+            self._calibration = self._said = None
             self._held.clear()
             self._status.dropped("calibration", error)
             return False
@@ -208,11 +222,15 @@ class CameraInput:
         self._given.clear()
         return True
 
+    @property
+    def _frame(self) -> str:
+        """The camera's frame, as its calibration or else its pictures say it."""
+        return (self._calibration.frame_id if self._calibration is not None else "") or self._picture_frame
+
     def _mounting(self) -> Pose | None:
-        assert self._calibration is not None
-        if self._calibration.frame_id in ("", self._base_frame):
-            return None
-        return self._transforms.newest_lookup(self._base_frame, self._calibration.frame_id)
+        if self._frame == self._base_frame:
+            return Pose(np.zeros(3), Rotation.identity())
+        return self._transforms.newest_lookup(self._base_frame, self._frame) if self._frame else None
 
     def reset(self) -> str:
         """Start anew with the next picture; returns what that means, in words."""
