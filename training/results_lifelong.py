@@ -74,6 +74,8 @@ def main(arguments: Arguments) -> dict[str, Any]:
 
 def _command(arguments: Arguments) -> str:
     chosen = " ".join(f"--{name} {getattr(arguments, name)}" for name in ("buildings", "aliased", "robots", "scans"))
+    if arguments.split != "test":
+        chosen += f" --split {arguments.split}"
     return f'make results WORLD=lifelong ARGS="{chosen}"'
 
 
