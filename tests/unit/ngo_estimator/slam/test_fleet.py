@@ -10,6 +10,7 @@ import pytest
 from ngo_estimator.data.relative_step import DuplicateStep, LateStep, RejectedStep, RelativeStep
 from ngo_estimator.geometry.planar_covariance import position_std
 from ngo_estimator.geometry.planar_motion import compose
+from ngo_estimator.graph.robust import Robust
 from ngo_estimator.slam.fleet import Fleet, FleetUpdate
 from ngo_estimator.slam.scan_trajectory import ScanTrajectory
 from tests.unit.ngo_estimator.loops.buildings import between
@@ -48,7 +49,7 @@ def off_m(fleet: Fleet, robot: str, begin: np.ndarray, truth: np.ndarray) -> flo
     return float(np.abs(whole.poses_xyyaw - between(begin[None], truth))[:, :2].max())
 
 
-def test_robots_that_meet_share_a_map_and_one_elsewhere_has_its_own() -> None:
+def test_robots_that_meet_share_a_map_and_one_elsewhere_has_its_own(monkeypatch: pytest.MonkeyPatch) -> None:
     fleet = Fleet(ScanTrajectory(), list(robots()))
     told: dict[str, list[FleetUpdate]] = {robot: [] for robot in robots()}
     for k in range(60):
@@ -69,6 +70,14 @@ def test_robots_that_meet_share_a_map_and_one_elsewhere_has_its_own() -> None:
         pose, covariance = fleet.pose(robot)
         assert 1e-3 < position_std(covariance) < 0.4
         np.testing.assert_allclose(told[robot][-1].update.pose_xyyaw, pose, atol=0.05)
+    # A loop that is taken out leaves what the others join, though nothing is optimised.
+    monkeypatch.setattr(Robust, "correct", lambda *_: 1 / 0)
+    whole = fleet.core.trajectory()
+    assert whole is not None and fleet.core.remove_loops(*whole.loops[0].tolist()) == 1
+    assert "division by zero" in fleet.core.fault
+    for step in robots()["red"][60:62]:
+        assert fleet.update("red", step, optimize=False).map_of is None
+    assert [fleet.map_of(robot) for robot in robots()] == [None, None, "green"]
 
 
 def test_a_robot_that_starts_anew_is_found_again_and_lost_steps_cost_nothing() -> None:
@@ -77,6 +86,7 @@ def test_a_robot_that_starts_anew_is_found_again_and_lost_steps_cost_nothing() -
     before = fleet.trajectory("red")
     assert before is not None
     lost = drive(fleet, "red", anew[:20])
+    assert len(fleet.core.back_end._own_maps) == 1  # none of the stream that ended
     assert lost[0].begins and not any(update.begins for update in lost[1:])
     assert all(update.map_of == "red" and not update.update.restarted for update in lost)
     whole = fleet.core.trajectory()

@@ -114,13 +114,13 @@ class ScanLoopFinder:
         self.doubted = self.doubted[~chosen[self.doubted]]
         return int(chosen[used].sum())
 
-    def thin(self, keep: np.ndarray, used: ScanLoops, newest: int) -> None:
+    def thin(self, keep: np.ndarray, used: ScanLoops, newest: np.ndarray) -> None:
         """Let go of the keys that are not among ``keep`` ``(keys,)``; the graph then uses the loops ``used``.
 
-        Loops of the ``newest`` keys that it does not use stay as well: others may still agree with them.
+        Loops of the keys ``newest`` ``(keys,)`` that it does not use stay as well: others may still agree with them.
         """
         found, number = self.loops, np.cumsum(keep) - 1
-        waits = (found.pairs[:, 1] >= len(keep) - newest) & keep[found.pairs].all(1)
+        waits = newest[found.pairs[:, 1]] & keep[found.pairs].all(1)
         waits[self.used] = False
         unused = np.flatnonzero(waits)
         loops = used.extended(found[unused])

@@ -25,7 +25,7 @@ from ngo_estimator.loops.scan_loops import ScanLoops
 from ngo_estimator.loops.scan_settings import ScanGraphConfig
 from ngo_estimator.loops.thinned_loops import without_nodes
 from ngo_estimator.loops.walls_seen_through import profile_rays
-from ngo_estimator.slam.back_end import BackEnd, ClosedLoops, require_sound
+from ngo_estimator.slam.back_end import BackEnd, ClosedLoops, WhichLoops, require_sound
 from ngo_estimator.slam.localisation import Localiser
 from ngo_estimator.slam.map_origin import MapOrigin
 from ngo_estimator.slam.own_map import OwnMap
@@ -246,8 +246,8 @@ class ScanBackEnd(BackEnd):
     def _thin(self) -> None:
         """Let go of key scans whose places newer ones show; what their edges said goes to their neighbours."""
         graph, loops, count = self.graph, self.used_loops, len(self.graph)
-        nodes = np.arange(count)
-        stays = nodes > graph.stream_ends[graph.stream_of(nodes)] - self._newest
+        newest = self._newest
+        stays = newest.copy()
         stays[graph.ends_of_segments] = True
         for own_map in self._own_maps:
             stays[own_map.looks] = True
@@ -257,17 +257,22 @@ class ScanBackEnd(BackEnd):
             thinned = without_nodes(graph.poses, graph.steps, loops, self.closed.weight, leaves)
             graph.let_go(~leaves, thinned.bridges)
             self._scans.thin(~leaves)
-            self._finder.thin(~leaves, thinned.loops, self._newest)
+            self._finder.thin(~leaves, thinned.loops, newest)
             for own_map in self._own_maps:
                 own_map.thin(~leaves)
             self._loops_from_nothing = min(self._loops_from_nothing, len(thinned.loops))
             self._close(self.used_loops, thinned.weights)
 
     @property
-    def _newest(self) -> int:
-        """So many of the newest key scans stay: loops to come are measured with them, or agree with theirs."""
-        loops = self.config.loops
-        return max(loops.submap_keys, loops.source_keys, loops.neighbour_keys + 1)
+    def _newest(self) -> np.ndarray:
+        """The newest key scans ``(keys,)`` of each stream that goes on: loops to come are measured with them, or agree
+        with theirs."""
+        graph, loops, nodes = self.graph, self.config.loops, np.arange(len(self.graph))
+        stream = graph.stream_of(nodes)
+        goes_on = np.isin(graph.ranks, (*self._other_maps, graph.ranks[-1]))[stream]
+        many = max(loops.submap_keys, loops.source_keys, loops.neighbour_keys + 1)
+        newest: np.ndarray = goes_on & (nodes > graph.stream_ends[stream] - many)
+        return newest
 
     def _close(self, loops: ScanLoops, weights: np.ndarray) -> None:
         """Say what is thought of the loops that are used ``(n,)``."""
@@ -295,8 +300,15 @@ class ScanBackEnd(BackEnd):
         measured = RelativePoses.of_covariances(loops.pairs, loops.relative, loops.covariance)
         return self.graph.steps, measured
 
+    def _drop_loops(self, which: WhichLoops) -> int:
+        # What was thought of the others says which parts of the map are joined until all are optimised again.
+        used, closed = self._finder.used[: len(self.closed)].copy(), self.closed
+        removed = super()._drop_loops(which)
+        self.closed = closed[np.isin(used, self._finder.used)]
+        return removed
+
     def _forget_solution(self) -> None:
-        self.closed, self._loops_from_nothing = ClosedLoops.none(), 0
+        self._loops_from_nothing = 0
         self._claimed = self._claimed[:0]  # they are numbered by the loops that are used
 
     @property
@@ -354,7 +366,7 @@ class ScanBackEnd(BackEnd):
 
     def _warm_start(self, problem: GraphProblem) -> CorrectedGraph | None:
         """The last solution, whose nodes the newer ones follow; None where there is none."""
-        if len(self.closed) == 0:
+        if self._loops_from_nothing == 0:
             return None
         sound = np.ones(len(problem.steps))
         scale, before = float(self._scale[0]), self._loops_from_nothing
