@@ -64,6 +64,12 @@ def test_nobody_is_sure_of_the_way_while_the_wheels_are_silent() -> None:
     assert odometry.unplaced == len(times_s) - len(steps) - 1 > 0  # more pictures than may wait
 
 
+def test_slow_wheels_are_believed_from_reading_to_reading() -> None:
+    times_s = np.arange(0.0, 5.0, 1.0)
+    _, steps = dark(times_s, [(t, np.array((0.3 * t, 0.0, 0.0))) for t in times_s.tolist()])
+    assert len(steps) == 4 and all(step.covariance[0, 0] < 0.02**2 for step in steps)
+
+
 def test_wheels_that_start_again_elsewhere_are_not_believed() -> None:
     times_s = np.arange(0.0, 2.0, 0.1)
     wheels = [(t, np.array((0.3 * t + (10.0 if t < 1.0 else 0.0), 5.0 if t < 1.0 else 0.0, 0.0))) for t in times_s]

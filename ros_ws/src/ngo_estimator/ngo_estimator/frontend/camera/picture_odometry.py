@@ -169,11 +169,13 @@ class PictureOdometry:
             self.jumps += 1
             return self._velocity * took_s, (speed * took_s)[[0, 0, 1]] ** 2
         self._velocity = motion / took_s
-        # Between two readings the way strays from the line between them by so much, and by no more than the robot goes.
+        # Between two readings the way strays from the line between them by so much, and by no more than the robot goes;
+        # from one reading to the other it does not (a Brownian bridge).
         lengths_s, inside_s = self._wheels.gaps(last_ns * 1e-9, stamp_ns * 1e-9, config.silent_s)
         strays = np.minimum(acceleration * lengths_s[:, None] ** 2 / 8.0, speed * lengths_s[:, None] / 2.0)
-        variances: np.ndarray = (strays**2 * (inside_s / lengths_s)[:, None]).sum(0)[[0, 0, 1]]
-        return motion, variances
+        share = inside_s / lengths_s
+        variances: np.ndarray = (share * (1.0 - share)) @ strays**2
+        return motion, variances[[0, 0, 1]]
 
     def _key_code(self, grey: Grey) -> np.ndarray:
         self._key_pose = self._odometry.pose.copy()
