@@ -163,6 +163,17 @@ def test_scans_that_see_nothing_have_no_loops() -> None:
     assert (late > half - ScanLoopConfig().submap_keys).all()
 
 
+def test_loops_of_the_newest_keys_wait_when_others_are_let_go() -> None:
+    finder, scans = ScanLoopFinder(ScanGraphConfig()), scanned(HALLWAY, np.zeros((8, 3)))
+    for scan in scans:
+        finder.views.append(scan)
+    pairs = np.array(((0, 2), (1, 3), (0, 6), (1, 7)))
+    finder.add(ScanLoops(pairs, np.zeros((4, 3)), np.tile(np.eye(3), (4, 1, 1)), np.zeros((4, 6)), np.ones(4, bool)))
+    newest = np.isin(np.arange(8), (3, 7))  # the ends of two streams
+    finder.thin(np.arange(8) != 4, ScanLoops.none(), newest)
+    np.testing.assert_array_equal(finder.loops.pairs, ((1, 3), (1, 6)))
+
+
 def test_wrong_shapes_are_refused() -> None:
     scans = scanned(HALLWAY, TWICE[:2])
     with pytest.raises(ValueError, match="expected \\(keys, 3\\)"):

@@ -171,9 +171,8 @@ class RobotFleet:
 
     def _publish(self, robot: _Robot, step: "RelativeStep", update: "FleetUpdate") -> None:
         if update.begins and robot.newest is not None:
-            self.node.get_logger().info(
-                f"the odometry of {robot.name} began anew: looks for it in the map, which stays"
-            )
+            what = "so does the map of all" if update.map_of is None else "looks for it in the map, which stays"
+            self.node.get_logger().info(f"the odometry of {robot.name} began anew: {what}")
         robot.newest = update
         robot.odom_xyyaw = step.tf_odom_xyyaw if step.tf_odom_known else None
         if update.begins:  # another odometry has another map -> odom
