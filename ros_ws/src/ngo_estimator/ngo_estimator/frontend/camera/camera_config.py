@@ -26,8 +26,8 @@ class CameraConfig:
     unknown_speed: tuple[float, float] = (1.0, 1.0)
     unknown_acceleration: tuple[float, float] = (1.0, 2.0)
     # Speeds (m/s, rad/s) beyond which the given motion is a jump of its frame, and the least time they are taken over
-    # (s): robots on floors are slower by far, and a driver that starts again is farther away.
-    fastest: tuple[float, float] = (10.0, 10.0)
+    # (s): robots and cars in towns are slower, and a driver that starts again is farther away.
+    fastest: tuple[float, float] = (15.0, 10.0)
     least_s: float = 0.03
     # Deviation of the share by which all ranges are wrong together.
     scale_std: float = 0.1
