@@ -8,12 +8,10 @@ from typing import Any
 
 import cv2
 import numpy as np
-from nav_msgs.msg import Odometry
 from rclpy.node import Node
-from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.qos import QoSProfile, ReliabilityPolicy
 from scipy.spatial.transform import Rotation
 from sensor_msgs.msg import CameraInfo, CompressedImage, Image
-from tf2_msgs.msg import TFMessage
 
 from ngo_common.nodes.process import StartError
 from ngo_estimator.data.relative_step import RelativeStep
@@ -21,18 +19,15 @@ from ngo_estimator.frontend.camera.calibrated_camera import NOT_MOUNTED, calibra
 from ngo_estimator.frontend.camera.picture_odometry import PictureOdometry
 from ngo_estimator.nodes import messages
 from ngo_estimator.nodes.listening import Listening
+from ngo_estimator.nodes.robot_odometry import RobotOdometry
 from ngo_estimator.nodes.settings import LocalNodeSettings
 from ngo_estimator.nodes.status import NodeStatus
 from ngo_recordings.calibration import Calibration, calibration_of, info_topics
 from ngo_recordings.images import COMPRESSED_TYPE, IMAGE_TYPE, picture
-from ngo_recordings.odometry_poses import OdometryPoses
 from ngo_recordings.poses import Pose
-from ngo_recordings.transform_buffer import FramePoses, TransformBuffer
 
-_DEPTH = 1000
 _MOUNTING_WAIT_NS = 2_000_000_000
-_MOST_HELD = 64
-_NO_POSE = "pose has values that are not finite, or no orientation"
+_MOST_HELD, _MOST_GIVEN = 64, 1000
 
 
 class CameraInput:
@@ -53,11 +48,7 @@ class CameraInput:
             )
         cv2.setNumThreads(settings.threads)
         self._node, self._settings, self._publish = node, settings, publish
-        self._base_frame = settings.framed(settings.base_frame)
-        self._odom_frame = settings.framed(settings.odom_frame)
-        self._transforms = TransformBuffer()
-        self._wheels = FramePoses(self._transforms, self._odom_frame, self._base_frame)
-        self._odometry = OdometryPoses()
+        self._robot = RobotOdometry(node, settings, self._add_wheels, self._on_transforms, self._update)
         self._is_compressed = settings.image_transport == "compressed"
         self._topic = settings.image_topic + ("/compressed" if self._is_compressed else "")
         self._calibration: Calibration | None = None
@@ -66,18 +57,14 @@ class CameraInput:
         self._core: PictureOdometry | None = None
         self._mounted = False  # as transforms say
         self._held: deque[tuple[int, np.ndarray]] = deque(maxlen=_MOST_HELD)
-        self._given: deque[tuple[int, np.ndarray]] = deque(maxlen=_DEPTH)  # odometry before there is a core
+        self._given: deque[tuple[int, np.ndarray]] = deque(maxlen=_MOST_GIVEN)  # odometry before there is a core
         self._restarts = self._newly_alone = self._unplaced = self._jumps = 0
         self._newly_unplaced = self._newly_jumped = 0
 
     @property
     def description(self) -> str:
         """What the input listens to, in words."""
-        own = {
-            "topic": f"odometry on '{self._node.resolve_topic_name(self._settings.robot_odometry_topic)}'",
-            "tf": f"odometry from {self._odom_frame} to {self._base_frame} on TF",
-        }[self._settings.robot_odometry]
-        return f"pictures on '{self._node.resolve_topic_name(self._topic)}', {own}"
+        return f"pictures on '{self._node.resolve_topic_name(self._topic)}', {self._robot.description}"
 
     @property
     def _info_topics(self) -> tuple[str, ...]:
@@ -91,12 +78,7 @@ class CameraInput:
         listening.to(CompressedImage if self._is_compressed else Image, self._topic, self._on_picture, pictures)
         for topic in self._info_topics:
             listening.to_all(CameraInfo, topic, partial(self._on_info, topic), pictures)
-        if settings.robot_odometry == "topic":
-            listening.to(Odometry, settings.robot_odometry_topic, self._on_odometry, QoSProfile(depth=_DEPTH))
-        # Every node on a robot publishes transforms: no single publisher is held on to.
-        listening.to_all(TFMessage, settings.tf_topic, self._on_moving, QoSProfile(depth=_DEPTH))
-        latched = QoSProfile(depth=_DEPTH, durability=DurabilityPolicy.TRANSIENT_LOCAL)
-        listening.to_all(TFMessage, settings.tf_topic + "_static", self._on_static, latched)
+        self._robot.listen(listening, status)
 
     def _on_info(self, topic: str, message: CameraInfo) -> None:
         arrays = (np.asarray(values, np.float64).tobytes() for values in (message.k, message.p, message.d))
@@ -119,43 +101,16 @@ class CameraInput:
         self._publish(None)
         self._node.get_logger().warning(f"{why}: the odometry starts anew with it")
 
-    def _on_static(self, message: TFMessage) -> None:
-        self._take_transforms(message, static=True)
-
-    def _on_moving(self, message: TFMessage) -> None:
-        self._take_transforms(message, static=False)
-
-    def _take_transforms(self, message: TFMessage, static: bool) -> None:
-        bad = self._wheels.bad
-        for stamp_ns, pose in self._wheels.read(message.transforms, static):
-            if self._settings.robot_odometry == "tf":
-                self._add_wheels(stamp_ns, pose.planar()[0])
-        if self._wheels.bad > bad and self._settings.robot_odometry == "tf":
-            self._status.dropped("robot odometry", _NO_POSE)
+    def _on_transforms(self, static: bool) -> None:
         if self._core is not None and not self._mounted and self._mounting() is not None:
             self._begin_anew("the camera's mounting came late")
-        self._update()
-
-    def _on_odometry(self, message: Odometry) -> None:
-        try:
-            pose = self._odometry.read(message)
-        except ValueError as error:
-            self._status.dropped("robot odometry", error)
-            return
-        if pose is None:
-            self._status.dropped("robot odometry", _NO_POSE)
-            return
-        self._add_wheels(messages.to_ns(message.header.stamp), pose)
         self._update()
 
     def _add_wheels(self, stamp_ns: int, pose_xyyaw: np.ndarray) -> None:
         if self._core is None:
             self._given.append((stamp_ns, pose_xyyaw))
             return
-        try:
-            self._core.add_wheels(stamp_ns, pose_xyyaw)
-        except ValueError as error:
-            self._status.dropped("robot odometry", error)
+        self._core.add_wheels(stamp_ns, pose_xyyaw)
 
     def _on_picture(self, message: Any) -> None:
         kind, known = (COMPRESSED_TYPE if self._is_compressed else IMAGE_TYPE), self._calibration
@@ -204,7 +159,7 @@ class CameraInput:
         frame, logger = self._frame, self._node.get_logger()
         if mounting is None:
             logger.warning(
-                f"{self._settings.tf_topic}_static does not say where '{frame}' sits on '{self._base_frame}': "
+                f"{self._settings.tf_topic}_static does not say where '{frame}' sits on '{self._robot.base_frame}': "
                 f"{NOT_MOUNTED}"
             )
         try:
@@ -216,9 +171,11 @@ class CameraInput:
             self._status.dropped("calibration", error)
             return False
         self._mounted, self._restarts, self._unplaced, self._jumps = mounting is not None, 0, 0, 0
-        logger.info(f"camera: {model.width} x {model.height}, {model.description}, '{frame}' on '{self._base_frame}'")
+        logger.info(
+            f"camera: {model.width} x {model.height}, {model.description}, '{frame}' on '{self._robot.base_frame}'"
+        )
         for stamp_ns, pose in self._given:
-            self._add_wheels(stamp_ns, pose)
+            self._robot.add(stamp_ns, pose)
         self._given.clear()
         return True
 
@@ -228,9 +185,9 @@ class CameraInput:
         return (self._calibration.frame_id if self._calibration is not None else "") or self._picture_frame
 
     def _mounting(self) -> Pose | None:
-        if self._frame == self._base_frame:
+        if self._frame == self._robot.base_frame:
             return Pose(np.zeros(3), Rotation.identity())
-        return self._transforms.newest_lookup(self._base_frame, self._frame) if self._frame else None
+        return self._robot.transforms.newest_lookup(self._robot.base_frame, self._frame) if self._frame else None
 
     def reset(self) -> str:
         """Start anew with the next picture; returns what that means, in words."""
@@ -268,5 +225,5 @@ class CameraInput:
         if not self._given and (self._core is None or not self._core.has_wheels):
             found.append("no odometry of the robot came yet")
         if self._core is not None and not self._mounted:
-            found.append(f"no transform says where the camera sits on '{self._base_frame}'")
+            found.append(f"no transform says where the camera sits on '{self._robot.base_frame}'")
         return found

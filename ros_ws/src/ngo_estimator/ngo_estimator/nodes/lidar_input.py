@@ -7,19 +7,17 @@ from functools import partial
 from typing import Any
 
 import numpy as np
-from nav_msgs.msg import Odometry
 from rclpy.node import Node
-from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.qos import QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import CameraInfo, Image, LaserScan, PointCloud2
-from tf2_msgs.msg import TFMessage
 
 from ngo_estimator.data.relative_step import RelativeStep
 from ngo_estimator.frontend.intake.lidar_intake import LidarIntake
 from ngo_estimator.frontend.lidar.mixture_lidar import MixtureLidar
 from ngo_estimator.geometry.scan_points import Mounting
-from ngo_estimator.nodes import messages
 from ngo_estimator.nodes.listening import Listening
 from ngo_estimator.nodes.odometry_on_tf import OdometryOnTf
+from ngo_estimator.nodes.robot_odometry import RobotOdometry
 from ngo_estimator.nodes.settings import LocalNodeSettings
 from ngo_estimator.nodes.status import NodeStatus
 from ngo_estimator.nodes.weights import load_core
@@ -28,15 +26,11 @@ from ngo_estimator.offline.warm_up import warm_up_odometry
 from ngo_recordings.laser_scan import LidarScan, scan_of
 from ngo_recordings.mounting import Mounting as KnownMounting
 from ngo_recordings.mounting import mounting_in
-from ngo_recordings.odometry_poses import OdometryPoses
 from ngo_recordings.space_scan import cloud_scan, depth_scan, info_topic
-from ngo_recordings.transform_buffer import FramePoses, TransformBuffer
 
-_DEPTH = 1000
 _TYPES = {"LaserScan": LaserScan, "PointCloud2": PointCloud2, "depth": Image}
 _MOUNTING_WAIT_NS = 2_000_000_000
 _MOST_HELD = 200
-_NO_POSE = "pose has values that are not finite, or no orientation"
 
 
 class LidarInput:
@@ -54,12 +48,8 @@ class LidarInput:
         self._core = LidarIntake(load_core(MixtureLidar.load, settings), self._mounting_of, settings.min_range)
         with compiling(node.get_logger().info):
             warm_up_odometry()
-        self._base_frame = settings.framed(settings.base_frame)
-        self._odom_frame = settings.framed(settings.odom_frame)
-        self._transforms = TransformBuffer()
-        self._wheels = FramePoses(self._transforms, self._odom_frame, self._base_frame)
-        self._on_tf = OdometryOnTf(self._transforms, self._odom_frame, self._base_frame)
-        self._odometry = OdometryPoses()
+        self._robot = RobotOdometry(node, settings, self._core.add_wheels, self._on_transforms, self._update)
+        self._on_tf = OdometryOnTf(self._robot.transforms, self._robot.odom_frame, self._robot.base_frame)
         self._said = ""
         self._infos: dict[str, CameraInfo] = {}
         self._held: deque[LidarScan] = deque(maxlen=_MOST_HELD)
@@ -71,13 +61,8 @@ class LidarInput:
     @property
     def description(self) -> str:
         """What the input listens to, in words."""
-        own = {
-            "none": "no odometry of the robot",
-            "topic": f"odometry on '{self._node.resolve_topic_name(self._settings.robot_odometry_topic)}'",
-            "tf": f"odometry from {self._odom_frame} to {self._base_frame} on TF",
-        }[self._settings.robot_odometry]
         topics = "', '".join(map(self._node.resolve_topic_name, self._topics))
-        return f"{self._settings.scan_type} on '{topics}', {own}"
+        return f"{self._settings.scan_type} on '{topics}', {self._robot.description}"
 
     def listen(self, listening: Listening, status: NodeStatus) -> None:
         """Subscribe to scans, odometry and the scanner's mounting."""
@@ -89,26 +74,9 @@ class LidarInput:
             listening.to(_TYPES[settings.scan_type], topic, partial(self._on_scan, topic), scans, each_frame=True)
             if settings.scan_type == "depth":
                 listening.to_all(CameraInfo, info_topic(topic), partial(self._on_info, topic), scans)
-        if settings.robot_odometry == "topic":
-            listening.to(Odometry, settings.robot_odometry_topic, self._on_odometry, QoSProfile(depth=_DEPTH))
-        # Every node on a robot publishes transforms: no single publisher is held on to.
-        listening.to_all(TFMessage, settings.tf_topic, self._on_moving, QoSProfile(depth=_DEPTH))
-        latched = QoSProfile(depth=_DEPTH, durability=DurabilityPolicy.TRANSIENT_LOCAL)
-        listening.to_all(TFMessage, settings.tf_topic + "_static", self._on_static, latched)
+        self._robot.listen(listening, status)
 
-    def _on_static(self, message: TFMessage) -> None:
-        self._take_transforms(message, static=True)
-
-    def _on_moving(self, message: TFMessage) -> None:
-        self._take_transforms(message, static=False)
-
-    def _take_transforms(self, message: TFMessage, static: bool) -> None:
-        bad = self._wheels.bad
-        for stamp_ns, pose in self._wheels.read(message.transforms, static):
-            if self._settings.robot_odometry == "tf":
-                self._add_wheels(stamp_ns, pose.planar()[0])
-        if self._wheels.bad > bad and self._settings.robot_odometry == "tf":
-            self._status.dropped("robot odometry", _NO_POSE)
+    def _on_transforms(self, static: bool) -> None:
         for frame, known in list(self._mountings.items()):
             if static or known is None:
                 self._look_for_mounting(frame)
@@ -132,29 +100,13 @@ class LidarInput:
         self._held.append(scan)
         self._update()
 
-    def _on_odometry(self, message: Odometry) -> None:
-        try:
-            pose = self._odometry.read(message)
-        except ValueError as error:
-            self._status.dropped("robot odometry", error)
-            return
-        if pose is None:
-            self._status.dropped("robot odometry", _NO_POSE)
-            return
-        self._add_wheels(messages.to_ns(message.header.stamp), pose)
-        self._update()
-
-    def _add_wheels(self, stamp_ns: int, pose_xyyaw: np.ndarray) -> None:
-        try:
-            self._core.add_wheels(stamp_ns, pose_xyyaw)
-        except ValueError as error:
-            self._status.dropped("robot odometry", error)
-
     def _update(self) -> None:
         while self._held and self._is_mounted():
             scan = self._held.popleft()
             if scan.frame_id not in self._mountings:  # the first scanner is not held up by others
-                self._status.dropped("scan", f"no transform says where '{scan.frame_id}' sits on '{self._base_frame}'")
+                self._status.dropped(
+                    "scan", f"no transform says where '{scan.frame_id}' sits on '{self._robot.base_frame}'"
+                )
                 continue
             try:
                 self._core.add_scan(scan)
@@ -204,7 +156,7 @@ class LidarInput:
         if self._held[-1].stamp_ns - self._held[0].stamp_ns < _MOUNTING_WAIT_NS and len(self._held) < _MOST_HELD:
             return False
         self._node.get_logger().warning(
-            f"{self._settings.tf_topic}_static does not say where '{frame}' sits on '{self._base_frame}': it is "
+            f"{self._settings.tf_topic}_static does not say where '{frame}' sits on '{self._robot.base_frame}': it is "
             "taken to be there, looking ahead, until a transform says it"
         )
         self._mountings[frame] = None
@@ -212,10 +164,10 @@ class LidarInput:
 
     def _look_for_mounting(self, frame: str) -> None:
         """Take the mounting that the transforms say by now, if it is news."""
-        if frame in ("", self._base_frame):
+        if frame in ("", self._robot.base_frame):
             self._mountings[frame] = None
             return
-        found = mounting_in(self._transforms, self._base_frame, frame, self._settings.tf_topic)
+        found = mounting_in(self._robot.transforms, self._robot.base_frame, frame, self._settings.tf_topic)
         known = self._mountings.get(frame)
         if found is None or (known is not None and found.near(known)):
             return
@@ -268,8 +220,8 @@ class LidarInput:
         if self._settings.robot_odometry != "none" and not self._core.has_wheels:
             found.append("no odometry of the robot came yet")
         for frame, known in self._mountings.items():
-            if known is None and frame not in ("", self._base_frame):
-                found.append(f"no transform says where '{frame}' sits on '{self._base_frame}'")
+            if known is None and frame not in ("", self._robot.base_frame):
+                found.append(f"no transform says where '{frame}' sits on '{self._robot.base_frame}'")
         found += self._core.problems()
         if problem := self._on_tf.problem():
             found.append(problem)
