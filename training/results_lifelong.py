@@ -1,30 +1,39 @@
-"""The tables of maps that last: several robots in one building, each mapped alone and all together.
+"""The tables of maps that last: several robots in one building, and one robot in a building that changes for a year.
 
     python -m training.results --world lifelong
-    python -m training.results --world lifelong --buildings 3 --aliased 3 --scans 1500
+    python -m training.results --world lifelong --tables fleet --buildings 3 --aliased 3 --scans 1500
+    python -m training.results --world lifelong --tables year --years 1 --drives 20 --year-scans 1000
 
-What is measured is kept in ``runs/``. The command writes ``training/results/lifelong.json`` and
-``docs/results_lifelong.md`` with its picture.
+What is measured is kept in ``runs/``, of a year each drive, so that the command goes on after a stop. It writes
+``training/results/lifelong.json`` and ``docs/results_lifelong.md`` with its pictures. A table that is not measured
+stays as the JSON has it.
 """
 
+import json
 from dataclasses import dataclass
 from functools import partial
 from typing import Any, Literal
 
 from ngo_estimator.frontend.lidar import mixture_lidar
-from ngo_estimator.slam import fleet, scan_trajectory
+from ngo_estimator.mapping import scan_map
+from ngo_estimator.slam import fleet, scan_trajectory, session
 from training.common import records
 from training.common.command_line import check_at_least
+from training.common.source_code import code_digest
 from training.data import fleet_drives as drives_module
+from training.data import year_drives
 from training.data.building_drives import BUILDING_TEST_SEEDS
 from training.data.fleet_drives import fleet_drives
 from training.report import lifelong_page
 from training.report.folders import Folders
-from training.scoring import fleet_rows
+from training.scoring import fleet_rows, year_rows
 from training.scoring.fleet_rows import FleetRuns
 from training.scoring.statistics import mean_interval
 from training.scoring.table import Drive, Numbers, Row, Table, column, folder_digest, intervals, measure, pairs, samples
+from training.scoring.year_rows import Year, patrol, year_numbers, year_ratios
 
+_YEAR_CODE = (session, scan_map, scan_trajectory, mixture_lidar, year_rows)
+_YEAR_FIRST = 200
 _CODE = (fleet, scan_trajectory, mixture_lidar, fleet_rows)
 _SEEDS = {"validation": range(12_000, 13_000), "test": BUILDING_TEST_SEEDS[600:]}
 _ROWS = ("alone", "together")
@@ -37,6 +46,8 @@ class Arguments(Folders):
 
     world: Literal["lifelong"] = "lifelong"
     """World to measure in."""
+    tables: tuple[Literal["fleet", "year"], ...] = ("fleet", "year")
+    """Tables to measure."""
     buildings: int = 5
     """Buildings that robots map together."""
     aliased: int = 5
@@ -45,41 +56,88 @@ class Arguments(Folders):
     """Robots in each building."""
     scans: int = 2000
     """Scans of each robot, ten a second."""
+    years: int = 3
+    """Buildings that a robot patrols for a year."""
+    drives: int = 200
+    """Drives of a year."""
+    year_scans: int = 2000
+    """Scans of each drive."""
+    starts: int = 4
+    """Starts in each drive at which a robot looks for itself in the map so far."""
     split: Literal["validation", "test"] = "test"
     """Seeds of the buildings. Settings are chosen on validation; test is for the final table alone."""
 
     def __post_init__(self) -> None:
-        check_at_least(self, buildings=2, aliased=2, robots=2, scans=200)
+        check_at_least(self, buildings=2, aliased=2, robots=2, scans=200, years=1, drives=2, year_scans=400, starts=1)
         if self.buildings > _ALIASED_FIRST:
             raise ValueError(f"buildings is {self.buildings}; expected at most {_ALIASED_FIRST}")
 
 
 def main(arguments: Arguments) -> dict[str, Any]:
     """Measure, write everything, and return the JSON's content."""
-    record = records.record("results", arguments)
-    found = {kind: _measured(kind, arguments) for kind in ("buildings", "aliased")}
+    record, path = records.record("results", arguments), arguments.out / "lifelong.json"
+    result: dict[str, Any] = json.loads(path.read_text()) if path.exists() else {"tables": {}}
+    made: dict[str, dict[str, Table]] = {"fleet": {}, "year": {}}
+    for name in arguments.tables:
+        made[name] = {kind: _measured(kind, arguments) for kind in _KINDS[name]}
+        how = {"command": _command(arguments, name), "revision": record["revision"]}
+        settings = {setting: getattr(arguments, setting) for setting in ("split", *_SETTINGS[name])}
+        if name == "fleet":
+            result |= {**how, "settings": settings, **_fleet(made[name], result["tables"])}
+        else:
+            result |= {
+                "year": {**how, "settings": settings, "ratios": year_ratios(column(made[name]["year"], "learn"))}
+            }
+            result["tables"]["year"] = year_numbers(column(made[name]["year"], "learn"))
+    lifelong_page.draw(arguments.images, made["fleet"], made["year"].get("year", {}))
+    return arguments.publish("lifelong", result, lifelong_page.page(result, arguments.images))
+
+
+_KINDS = {"fleet": ("buildings", "aliased"), "year": ("year",)}
+_SETTINGS = {"fleet": ("buildings", "aliased", "robots", "scans"), "year": ("years", "drives", "year_scans", "starts")}
+
+
+def _fleet(found: dict[str, Table], tables: dict[str, Any]) -> dict[str, Any]:
     names = {"buildings": "", "aliased": "aliased_"}
-    result = {
-        "command": _command(arguments),
-        "revision": record["revision"],
-        "settings": {name: getattr(arguments, name) for name in ("split", "buildings", "aliased", "robots", "scans")},
-        "tables": {
-            "fleet": {f"{names[kind]}{row}": _numbers(table, row) for kind, table in found.items() for row in _ROWS}
-        },
+    fleet = {f"{names[kind]}{row}": _numbers(table, row) for kind, table in found.items() for row in _ROWS}
+    return {
+        "tables": {**tables, "fleet": fleet},
         "paired": {f"{names[kind]}together": {"ate_ratio": _ratio(table)} for kind, table in found.items()},
     }
-    images = lifelong_page.draw(arguments.images, found)
-    return arguments.publish("lifelong", result, lifelong_page.page(result, images))
 
 
-def _command(arguments: Arguments) -> str:
-    chosen = " ".join(f"--{name} {getattr(arguments, name)}" for name in ("buildings", "aliased", "robots", "scans"))
+def _command(arguments: Arguments, table: str) -> str:
+    chosen = " ".join(f"--{name.replace('_', '-')} {getattr(arguments, name)}" for name in _SETTINGS[table])
     if arguments.split != "test":
         chosen += f" --split {arguments.split}"
-    return f'make results WORLD=lifelong ARGS="{chosen}"'
+    return f'make results WORLD=lifelong ARGS="--tables {table} {chosen}"'
 
 
 def _measured(kind: str, arguments: Arguments) -> Table:
+    return _years(arguments) if kind == "year" else _fleets(kind, arguments)
+
+
+def _years(arguments: Arguments) -> Table:
+    weights, folder = arguments.weights / "scan", arguments.runs / "lifelong"
+    identity = f"{folder_digest(weights)} {code_digest((*_YEAR_CODE, year_drives))}"
+    row = Row(partial(patrol, identity=identity), folder_digest(weights), _YEAR_CODE)
+    of_each = arguments.drives, arguments.year_scans, arguments.starts
+    plan = [
+        (
+            Drive(
+                f"year_{seed}",
+                f"building {seed}, {of_each} drives, scans, starts",
+                partial(Year, seed, *of_each, weights, folder / f"year_{seed}"),
+                (year_drives,),
+            ),
+            {"learn": row},
+        )
+        for seed in _SEEDS[arguments.split][_YEAR_FIRST:][: arguments.years]
+    ]
+    return measure(plan, folder, "year")
+
+
+def _fleets(kind: str, arguments: Arguments) -> Table:
     aliased = kind == "aliased"
     seeds = _SEEDS[arguments.split]
     seeds = seeds[_ALIASED_FIRST:][: arguments.aliased] if aliased else seeds[: arguments.buildings]

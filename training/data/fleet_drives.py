@@ -6,6 +6,7 @@ from dataclasses import replace
 
 from ngo_sim.building2d import Building2d, BuildingDrive
 from ngo_sim.floor_plans import FloorPlanConfig
+from ngo_sim.lidar import ScannerConfig
 from training.data.building_drives import lidar_drive
 from training.data.lidar_drives import LidarDrive
 
@@ -22,10 +23,7 @@ def fleet_drives(seed: int, robots: int, scans: int, aliased: bool = False) -> t
     Doors and people are each robot's own: the robots do not see each other.
     """
     plan = FloorPlanConfig(aliased=aliased)
-    drawn = Building2d(plan)
-    drawn.reset(seed)
-    scanner = replace(drawn.scanner, rays=_RAYS, scan_period_s=1.0 / RATE_HZ)
-    building = Building2d(plan, scanner)
+    building = Building2d(plan, patrol_scanner(seed, plan))
     kind = "aliased" if aliased else "building"
     return tuple(
         lidar_drive(
@@ -35,6 +33,13 @@ def fleet_drives(seed: int, robots: int, scans: int, aliased: bool = False) -> t
         )
         for robot in range(robots)
     )
+
+
+def patrol_scanner(seed: int, plan: FloorPlanConfig) -> ScannerConfig:
+    """The scanner that is drawn for a building, with 360 rays ten times a second."""
+    drawn = Building2d(plan)
+    drawn.reset(seed)
+    return replace(drawn.scanner, rays=_RAYS, scan_period_s=1.0 / RATE_HZ)
 
 
 def _from_now_on(drive: BuildingDrive) -> BuildingDrive:

@@ -82,7 +82,9 @@ def changed(config: Config, changes: Mapping[str, Any]) -> Config:
 
 
 @dataclass(frozen=True, eq=False)
-class _Front:
+class Front:
+    """What odometry gave: its steps, the age of scans that it found, unsure steps, and its computing time."""
+
     steps: list[LidarStep]
     lag_s: float
     unsure: int
@@ -94,7 +96,7 @@ class _Run:
     online: ScanTrajectory
     trajectory: Trajectory
     covariances: np.ndarray
-    front: _Front
+    front: Front
     back_s: float
 
 
@@ -104,7 +106,7 @@ class DriveRuns:
     def __init__(self, drive: LidarDrive, weights: Path) -> None:
         self.drive = drive
         self._weights = weights
-        self._fronts: dict[str, _Front] = {}
+        self._fronts: dict[str, Front] = {}
         self._runs: dict[str, _Run] = {}
 
     def run(self, pipeline: Pipeline) -> _Run:
@@ -112,10 +114,11 @@ class DriveRuns:
         pipeline = dataclasses.replace(pipeline, wheels=pipeline.wheels and bool(self.drive.wheels))
         key = identity_of(pipeline)
         if key not in self._runs:
-            self._runs[key] = self._optimized(self._front(pipeline), pipeline)
+            self._runs[key] = self._optimized(self.front(pipeline), pipeline)
         return self._runs[key]
 
-    def _front(self, pipeline: Pipeline) -> _Front:
+    def front(self, pipeline: Pipeline) -> Front:
+        """Odometry over the drive."""
         key = identity_of(dataclasses.replace(pipeline, graph={}))
         if key not in self._fronts:
             settings = changed(read_mixture_config(self._weights), pipeline.odometry)
@@ -131,10 +134,10 @@ class DriveRuns:
                 _take(odometry, steps, at_end=False)
             _take(odometry, steps, at_end=True)
             took_s = time.process_time() - began
-            self._fronts[key] = _Front(steps, odometry.lag_s, sum(step.unsure for step in steps), took_s)
+            self._fronts[key] = Front(steps, odometry.lag_s, sum(step.unsure for step in steps), took_s)
         return self._fronts[key]
 
-    def _optimized(self, front: _Front, pipeline: Pipeline) -> _Run:
+    def _optimized(self, front: Front, pipeline: Pipeline) -> _Run:
         settings = changed(read_lidar_file(self._weights, "graph", ScanGraphConfig), pipeline.graph)
         online = ScanTrajectory(settings)
         covariances = [np.zeros((3, 3))]

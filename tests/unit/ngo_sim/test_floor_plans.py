@@ -1,6 +1,7 @@
 """Floor plans are connected, the same for the same seed, and made of known walls where the polygons are known."""
 
 import dataclasses
+import itertools
 
 import numpy as np
 import pytest
@@ -82,6 +83,16 @@ def test_doors_open_and_close_between_visits_and_passable_ones_stay_open() -> No
     np.testing.assert_allclose(np.hypot(*np.moveaxis(leaves[..., 2:] - leaves[..., :2], -1, 0))[0], doors.widths_m)
     assert np.degrees(doors.angles_rad[doors.passable]).min() > 85
     assert (doors.angles_rad[~doors.passable] == 0.0).any()
+
+
+def test_one_piece_of_furniture_in_twenty_is_moved_each_time_and_walls_stay() -> None:
+    plans = [draw_floor_plan(3, FloorPlanConfig(scale=SMALL, furniture_moves=moves)) for moves in (0, 1, 2)]
+    for before, after in itertools.pairwise(plans):
+        moved = (before.circles_m != after.circles_m).any(axis=1)
+        assert 0.0 < moved.mean() < 0.15
+        np.testing.assert_array_equal(before.circles_m[:, 2], after.circles_m[:, 2])
+        assert 0.0 < (before.segments_m != after.segments_m).any(axis=1).mean() < 0.1
+        assert len(RouteMap(after, 0.25).goals_m) == len(after.goals_m), "every goal can still be reached"
 
 
 def test_aliased_rooms_repeat_and_others_do_not() -> None:

@@ -30,6 +30,7 @@ from ngo_sim.furniture import (
 
 LANE_WIDTH_M = 0.9
 _DOOR_EPOCHS = 32
+_MOVED_SHARE = 0.05
 _MARGIN_M = 2.0
 
 
@@ -49,6 +50,12 @@ class FloorPlanConfig(Settings):
     )
     clutter: float = setting(
         1.0, "Amount of furniture and of objects in corridors; 0: empty rooms, 1: usual.", minimum=0.0, maximum=2.0
+    )
+    furniture_moves: int = setting(
+        0,
+        "How many times furniture of rooms and halls was moved, each time one piece in twenty, within its room.",
+        minimum=0,
+        maximum=1000,
     )
     people: int = setting(3, "Number of people who walk from room to room.", minimum=0, maximum=50)
     plan: str = setting(
@@ -135,6 +142,7 @@ class _Builder:
         self.segments: list[Floats] = []
         self.circles: list[Floats] = []
         self.doors: list[tuple[Floats, float, float, float, Floats, float, float, bool]] = []
+        self._placers: list[tuple[int, int, Placer]] = []  # with the first of its segments and circles
         self._solid: list[Floats] = []  # rooms, corridors and halls: what a new room must keep off
         for corridor in layout.corridors:
             for quad in corridor.quads():
@@ -189,6 +197,7 @@ class _Builder:
             furnish_hall(placer := Placer(polygon, self.lanes, self.rng), self.rng)
             self._take(placer)
         self._corridor_clutter()
+        self._rearrange()
 
     def _room(
         self, corridor: Corridor, along: float, side: float, wall_m: float, rng: np.random.Generator
@@ -370,8 +379,18 @@ class _Builder:
                     self.circles.append(circles)
 
     def _take(self, placer: Placer) -> None:
+        self._placers.append((len(self.segments), len(self.circles), placer))
         self.segments += placer.segments
         self.circles += placer.circles
+
+    def _rearrange(self) -> None:
+        """Move furniture as often as the settings say; more moves begin with the same ones."""
+        for move in range(self.config.furniture_moves):
+            rng = np.random.default_rng((self.seed, 4, move))
+            for segment, circle, placer in self._placers:
+                placer.rearrange(_MOVED_SHARE, rng)
+                self.segments[segment : segment + len(placer.segments)] = placer.segments
+                self.circles[circle : circle + len(placer.circles)] = placer.circles
 
 
 def _middle_between(first: Floats, second: Floats) -> Floats:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -87,7 +88,9 @@ class Placer:
     """
 
     def __init__(self, room: Floats, clear: list[Floats], rng: np.random.Generator) -> None:
-        self._room, self._taken, self._rng = room, list(clear), rng
+        self._room, self._clear, self._rng = room, list(clear), rng
+        self._items: list[Item] = []
+        self._footprints: list[Floats] = []
         self.segments: list[Floats] = []
         self.circles: list[Floats] = []
 
@@ -96,13 +99,26 @@ class Placer:
         footprint = rectangle(center, yaw_rad, *item.size_m)
         if not contains(self._room, footprint, 0.01).all():
             return False
-        if any(overlap(footprint, taken, gap_m) for taken in self._taken):
+        if any(overlap(footprint, taken, gap_m) for taken in (*self._clear, *self._footprints)):
             return False
-        segments, circles = item.placed(center, yaw_rad)
-        self._taken.append(footprint)
-        self.segments.append(segments)
-        self.circles.append(circles)
+        for column, value in zip(self._columns, (item, footprint, *item.placed(center, yaw_rad)), strict=True):
+            column.append(value)
         return True
+
+    @property
+    def _columns(self) -> tuple[list[Any], ...]:
+        """What is known of each item."""
+        return self._items, self._footprints, self.segments, self.circles
+
+    def rearrange(self, share: float, rng: np.random.Generator) -> None:
+        """Move each item, with the probability ``share``, to a wall or into the room where there is space for it."""
+        self._rng = rng
+        for index in np.flatnonzero(rng.random(len(self._items)) < share).tolist():
+            row = [column.pop(index) for column in self._columns]
+            if self.at_wall(row[0]) is not None or self.inside(row[0]):
+                row = [column.pop() for column in self._columns]
+            for column, value in zip(self._columns, row, strict=True):
+                column.insert(index, value)
 
     def at_wall(self, item: Item, tries: int = 6) -> tuple[Floats, float] | None:
         """Place an item with its back (+y) to some wall; returns its middle and its yaw, None where it fits nowhere."""

@@ -1,0 +1,62 @@
+"""A year of patrols: its rows against answers by hand, and a short one in a real building."""
+
+import dataclasses
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from ngo_estimator.geometry import se2
+from training import results_lifelong
+from training.common.records import WEIGHTS
+from training.scoring import year_rows
+from training.scoring.table import Measured
+from training.scoring.year_rows import Year, patrol, rigid_motion
+
+
+def test_the_motion_between_maps_is_found_again() -> None:
+    motion = np.array((3.0, -1.0, 2.5))
+    points = np.random.default_rng(1).normal(size=(20, 2))
+    moved = se2.rotate(motion[2], points) + motion[:2]
+    np.testing.assert_allclose(rigid_motion(points, moved), motion, atol=1e-12)
+
+
+def a_year(drives: int) -> Measured:
+    """Its drive number ``n`` has the error n, needs n + 1 MB, and was not found at all where n is 5."""
+    number = np.arange(float(drives))
+    empty = {f"{kind}_{when}": np.zeros((2, 2), np.int8) for kind in ("found", "true") for when in _WHEN}
+    corners = {f"corners_{when}": np.zeros((2, 2)) for when in _WHEN}
+    errors = {"ate_m": np.where(number == 5.0, np.nan, number), "memory_mb": number + 1.0, "ms_a_scan": number + 1.0}
+    return Measured({**errors, "iou": 0.0 * number}, {**empty, **corners})
+
+
+_WHEN = ("first", "middle", "last")
+
+
+def test_the_table_has_ten_drives_a_row_and_keeps_what_is_not_measured(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(results_lifelong, "patrol", lambda year, identity: a_year(year.drives))
+    folders: dict[str, Any] = {name: tmp_path / name for name in ("out", "docs", "runs")}
+    folders["out"].mkdir()
+    (folders["out"] / "lifelong.json").write_text('{"tables": {"join": {}}}')
+    chosen = results_lifelong.Arguments(split="validation", tables=("year",), years=2, drives=30, **folders)
+    result = results_lifelong.main(chosen)
+    assert set(result["tables"]) == {"join", "year"}
+    assert list(result["tables"]["year"]) == ["first_ten", "eleven_to_twenty", "last_ten"]
+    means = [row["ate_m"]["mean"] for row in result["tables"]["year"].values()]
+    assert means == pytest.approx([40.0 / 9.0, 14.5, 24.5])
+    assert result["year"]["ratios"]["memory_mb"]["mean"] == pytest.approx(25.5 / 15.5)
+    assert "| last ten | 24.5 " in (tmp_path / "docs" / "results_lifelong.md").read_text()
+
+
+def test_a_year_goes_on_from_what_is_on_disk(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(year_rows, "MOST_SCANS", 100)
+    year = Year(12_001, 1, 400, 1, WEIGHTS / "scan", tmp_path)
+    first = patrol(year, "toy")
+    longer = patrol(dataclasses.replace(year, drives=2), "toy")
+    assert longer.errors["ate_m"][0] == first.errors["ate_m"][0] < 0.1
+    assert longer.errors["iou"][0] > 0.8
+    assert longer.errors["nodes"][1] >= longer.errors["nodes"][0] > 20
+    assert np.isnan(longer.errors["load_s"][0]) and longer.errors["load_s"][1] > 0.0
