@@ -1,4 +1,4 @@
-"""Node that shows a running graph in the browser: map, trajectories, loops, the newest picture or scan, and errors."""
+"""Node that shows a running graph in the browser: map, trajectories, loops, frontiers, picture or scan, errors."""
 
 import sys
 from collections.abc import Callable
@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from geometry_msgs.msg import PoseWithCovarianceStamped
-from nav_msgs.msg import OccupancyGrid, Odometry
+from nav_msgs.msg import OccupancyGrid, Odometry, Path
 from ngo_msgs.msg import Trajectory
 from rclpy.clock import Clock, ClockType
 from rclpy.node import Node
@@ -78,6 +78,8 @@ class ViewNode(Node):
             (Trajectory, settings.trajectory_topic, self._keep("trajectory"), 1),
             (PoseWithCovarianceStamped, settings.pose_topic, self._keep("pose"), newest),
             (MarkerArray, settings.loops_topic, self._keep("loops"), 1),
+            (MarkerArray, settings.frontiers_topic, self._keep("frontiers"), latched),
+            (Path, settings.plan_topic, self._keep("plan"), newest),
             (OccupancyGrid, settings.map_topic, self._keep("map"), latched),
             (picture_type, topic, self._keep("picture"), newest),
             (LaserScan, settings.scan_topic, self._keep("scan"), newest),
@@ -105,6 +107,8 @@ class ViewNode(Node):
             ("pose", self._show_pose),
             ("trajectory", self._show_trajectory),
             ("loops", self._show_loops),
+            ("frontiers", self._show_frontiers),
+            ("plan", self._show_plan),
             ("map", self._show_map),
             ("picture", self._show_picture),
             ("scan", self._show_scan),
@@ -128,6 +132,15 @@ class ViewNode(Node):
         points = [[point.x, point.y] for marker in message.markers for point in marker.points]
         colors = [[color.r, color.g, color.b, color.a] for marker in message.markers for color in marker.colors]
         self._view.show_loops(np.array(points).reshape(-1, 2, 2), np.array(colors).reshape(-1, 4)[::2])
+
+    def _show_frontiers(self, message: MarkerArray) -> None:
+        points = [[point.x, point.y] for marker in message.markers for point in marker.points]
+        colors = [[each.color.r, each.color.g, each.color.b] for each in message.markers for _ in each.points]
+        self._view.show_frontiers(np.array(points).reshape(-1, 2), np.array(colors).reshape(-1, 3))
+
+    def _show_plan(self, message: Path) -> None:
+        points = [[pose.pose.position.x, pose.pose.position.y] for pose in message.poses]
+        self._view.show_plan(np.array(points).reshape(-1, 2))
 
     def _show_map(self, message: OccupancyGrid) -> None:
         info = message.info

@@ -30,6 +30,8 @@ class ViewNodeSettings(FramedSettings):
     trajectory_topic: str = topic("ngo/trajectory", "Corrected trajectory.")
     pose_topic: str = topic("ngo/pose", "Corrected newest pose with covariance.")
     loops_topic: str = topic("ngo/loops", "Loop closures.")
+    frontiers_topic: str = topic("explore/frontiers", "What is left to explore.")
+    plan_topic: str = topic("explore/path", "Path that the robot means to drive; its end is shown as the goal.")
     map_topic: str = topic("map", "Occupancy grid.")
 
     def __post_init__(self) -> None:

@@ -12,7 +12,7 @@ from ngo_estimator.view.shapes import Window
 TRUTH, ODOMETRY, CORRECTED = (31, 111, 214), (44, 160, 44), (255, 127, 14)
 """Colours of the demo's picture."""
 COLORS = {"truth": TRUTH, "odometry": ODOMETRY, "corrected": CORRECTED}
-_SCAN, _ROBOT = (214, 39, 40), (0, 0, 0)
+_SCAN, _ROBOT, _PLAN = (214, 39, 40), (0, 0, 0), (148, 80, 200)
 _EYE_HEIGHT = 1.95  # times half of the window: the default field of view sees it whole
 _TIMELINE = "time"
 
@@ -68,6 +68,17 @@ class RerunView:
         colors = np.round(255.0 * (1.0 - share * (1.0 - colors[:, :3]))).astype(np.uint8)
         raised = np.concatenate([lines, np.tile(0.01 * share[:, None], (1, 2, 1))], axis=2)
         self._stream.log("map/loops", rr.LineStrips3D(raised, colors=colors, radii=rr.Radius.ui_points(0.7)))
+
+    def frontiers(self, xy: np.ndarray, colors: np.ndarray) -> None:
+        """Points ``(n, 2)`` at the edge of the unknown, with colors ``(n, 3)``; see ``LiveView.show_frontiers``."""
+        shades = np.round(255.0 * colors).astype(np.uint8)
+        self._stream.log("map/frontiers", rr.Points3D(_raised(xy, 0.1), colors=shades, radii=rr.Radius.ui_points(2.0)))
+
+    def plan(self, xy: np.ndarray) -> None:
+        """The path ``(n, 2)`` that the robot means to drive, and its end."""
+        line = rr.LineStrips3D([_raised(xy, 0.11)], colors=[_PLAN], radii=rr.Radius.ui_points(1.5))
+        self._stream.log("map/plan", line)
+        self._stream.log("map/goal", rr.Points3D(_raised(xy[-1:], 0.13), colors=_PLAN, radii=rr.Radius.ui_points(5.0)))
 
     def robot(self, pose_xyyaw: np.ndarray, outline: np.ndarray, size_m: float) -> None:
         """The robot as an arrow of ``size_m``, and the outline ``(n, 2)`` of its uncertainty."""
