@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -131,7 +132,7 @@ class ExploreDemo:
             "time_s": round(self._time_s, 1),
             "area_m2": round(found.area, 1),
             "collisions": self._collisions,
-            "unreachable": list(found.reasons),
+            "unreachable": dict(Counter(found.reasons)),
         }
 
     def _on_truth(self, message: Odometry) -> None:

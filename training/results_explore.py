@@ -28,6 +28,7 @@ from ngo_explorer import (
     pilot,
     planner,
     put_aside,
+    revisits,
     rules,
     settings,
     tours,
@@ -62,9 +63,21 @@ from training.scoring.table import (
     samples,
 )
 
-ROWS = (*(rule for rule in RULES if rule != "tour"), "known_tour", "ours")
+ROWS = (*(rule for rule in RULES if rule != "tour"), "known_tour", "ours", "ours_accurate")
 BASE = "explore_lite"
-_EXPLORER = (exploration, frontiers, known_map, path_follower, pilot, planner, put_aside, rules, settings, tours)
+_EXPLORER = (
+    exploration,
+    frontiers,
+    known_map,
+    path_follower,
+    pilot,
+    planner,
+    put_aside,
+    revisits,
+    rules,
+    settings,
+    tours,
+)
 _CODE = (*_EXPLORER, exploring, known_tour)
 _BUILDING_SEEDS = {"validation": range(12_000, 13_000), "test": BUILDING_TEST_SEEDS}
 _MAZE_SEEDS = {"validation": VALIDATION_SEEDS, "test": TEST_SEEDS}
@@ -84,8 +97,8 @@ class Arguments(Folders):
     plans: Path | None = None
     """Folder of floor plans, for the kind plans."""
     rows: tuple[str, ...] = ROWS
-    """Rules to measure; explore_lite is always measured."""
-    own_rows: tuple[str, ...] = ("nearest", BASE, "ours")
+    """Rules to measure; explore_lite is always measured. ours_accurate needs poses of its own."""
+    own_rows: tuple[str, ...] = ("nearest", BASE, "ours", "ours_accurate")
     """Those of them to measure at poses of its own: each takes longer. Nobody drives the known tour without poses."""
     count: int = 10
     """Mazes."""
@@ -152,7 +165,8 @@ def _command(arguments: Arguments) -> str:
 
 
 def _table(kind: Kind, names: Sequence[str], arguments: Arguments) -> Table:
-    chosen = [name for name in names if kind not in WHEELS or name in (*arguments.own_rows, BASE)]
+    allowed = (*arguments.own_rows, BASE) if kind in WHEELS else [row for row in ROWS if row != "ours_accurate"]
+    chosen = [name for name in names if name in allowed]
     rows = {name: _row(name, kind, arguments) for name in chosen}
     plan = [(drive, rows) for drive in _drives(kind, arguments)]
     return measure(plan, arguments.runs / "explore" / kind, kind)
@@ -196,11 +210,12 @@ def _measure(
     place: Place, name: str, most_s: float, estimator: Callable[[np.ndarray], OwnPoses] | None = None
 ) -> Measured:
     world = place.make()
-    config = ExplorerConfig(rule="tour" if name in ("ours", "known_tour") else name, radius_m=world.radius_m)
+    config = ExplorerConfig(rule=name if name in RULES else "tour", radius_m=world.radius_m)
     if name == "known_tour":
         run = drive_known_tour(world, place.seen, config, DriveConfig(), most_s)
     else:
-        run = explore(world, place.seen, config, DriveConfig(), most_s=most_s, estimator=estimator)
+        accurate = name == "ours_accurate"
+        run = explore(world, place.seen, config, DriveConfig(), most_s=most_s, estimator=estimator, accurate=accurate)
     return Measured.of(
         scores(run, place.seen),
         path_m=run.path_m,
@@ -214,7 +229,6 @@ def _measure(
 
 def scores(run: Explored, seen: Seen) -> dict[str, float]:
     """The metrics of one exploration; a path that never reached 95 % has no length."""
-    free, occupied = intersections(run.found, seen.map)
     found: dict[str, float] = {
         **run.errors,
         "ended_early": float(run.ended and run.coverage[-1] < 0.98),
@@ -222,7 +236,8 @@ def scores(run: Explored, seen: Seen) -> dict[str, float]:
         "coverage": float(run.coverage[-1]),
         "path_m": float(run.path_m[-1]),
         "time_s": float(run.time_s[-1]),
-        "iou": 0.5 * (free + occupied),
+        "iou": 0.5 * sum(intersections(run.found, seen.map)),
+        "iou_true_poses": 0.5 * sum(intersections(run.at_true_poses, seen.map)),
         "collisions": 1e3 * run.collisions / max(float(run.path_m[-1]), 1.0),
         "decision_ms": float(np.percentile(run.decisions_ms, 99)) if len(run.decisions_ms) else 0.0,
     }

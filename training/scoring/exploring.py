@@ -31,8 +31,9 @@ class Explored:
     """One exploration of n maps.
 
     ``path_m``, ``coverage`` and ``time_s`` ``(n,)``: length of the path, share seen of what can be seen, and time.
-    ``poses_xyyaw`` ``(m, 3)`` true. ``ended`` says whether the robot ended it by itself. ``found`` is its own map, and
-    ``errors`` are those of its own poses, by the metric's key.
+    ``poses_xyyaw`` ``(m, 3)`` true. ``ended`` says whether the robot ended it by itself. ``found`` is its own map,
+    ``at_true_poses`` that of the same scans at true poses, and ``errors`` are those of its own poses, by the metric's
+    key.
     """
 
     path_m: np.ndarray
@@ -43,6 +44,7 @@ class Explored:
     collisions: int
     ended: bool
     found: OccupancyMap
+    at_true_poses: OccupancyMap
     errors: dict[str, float] = field(default_factory=dict)
 
     def path_to(self, coverage: float) -> float:
@@ -52,9 +54,15 @@ class Explored:
 
 
 class Estimator(Protocol):
-    """Who tells a robot its pose ``(3,)`` and its map, in the frame of the world."""
+    """Who tells a robot its pose ``(3,)``, of which time that is, and its map, in the frame of the world."""
 
     pose_xyyaw: np.ndarray
+    stamp_ns: int
+
+    @property
+    def deviation_m(self) -> float:
+        """Standard deviation of the position now."""
+        ...
 
     def take(self, sight: Sight) -> None:
         """Take what was measured."""
@@ -105,14 +113,15 @@ def explore(
     seed: int = 0,
     most_s: float = 3600.0,
     estimator: Callable[[np.ndarray], Estimator] | None = None,
+    accurate: bool = False,
 ) -> Explored:
     """Explore a world until the robot says that nothing is left, or for most_s of simulated time.
 
     estimator: begins one at the first pose; None: the robot knows its true poses. What it has seen is counted at true
-    poses always.
+    poses always. accurate: whether the robot goes back before its position gets too uncertain.
     """
     run = _Run(world, seen, estimator)
-    exploration = Exploration(config, seed=seed)
+    exploration = Exploration(config, seed=seed, accurate=accurate)
     run.drive(exploration, PathFollower(drive, run.need_m(config)), most_s)
     return run.explored()
 
@@ -156,6 +165,12 @@ class _Run:
         """Where the robot believes to be."""
         return self.sight.pose_xyyaw if self._estimator is None else self._estimator.pose_xyyaw
 
+    @property
+    def late_s(self) -> float:
+        """How old that pose is."""
+        known_ns = 0 if self._estimator is None else self._estimator.stamp_ns
+        return 1e-9 * (self.sight.stamp_ns - known_ns) if known_ns else 0.0
+
     def need_m(self, config: ExplorerConfig) -> float:
         """Clearance that the robot's middle needs."""
         return config.radius_m + config.margin_m + 0.5 * RESOLUTION_M
@@ -168,10 +183,12 @@ class _Run:
             mapped, decided, begun_s = self.look(), pilot.decided, time.process_time()
             if mapped or exploration.known.empty:
                 exploration.known.update(self.found.values, RESOLUTION_M, self.found.origin_xy)
+            if self._estimator is not None:
+                exploration.deviation_m = self._estimator.deviation_m
             pilot.step(self.pose_xyyaw, self.sight.time_s)
             if pilot.decided > decided:
                 self._decisions_ms.append(1e3 * (time.process_time() - begun_s))
-            self.move(*follower.step(exploration.known, self.pose_xyyaw, self.sight.time_s))
+            self.move(*follower.step(exploration.known, self.pose_xyyaw, self.sight.time_s, self.late_s))
         self._ended = pilot.state == DONE
 
     def look(self) -> bool:
@@ -212,7 +229,9 @@ class _Run:
         errors: dict[str, float] = {}
         if self._estimator is not None:
             errors = self._estimator.errors(TruePoses(np.array(self._stamps_ns), poses))
-        return Explored(path, coverage, times, poses, decisions, self._collisions, self._ended, self.found, errors)
+        true = _trinary(self._grid.cells(_OCCUPANCY))
+        counted = self._collisions, self._ended
+        return Explored(path, coverage, times, poses, decisions, *counted, self.found, true, errors)
 
 
 def _trinary(found: OccupancyMap) -> OccupancyMap:

@@ -28,7 +28,7 @@ class OwnPoses:
         self._odometry, self._online = MixtureLidar.load(weights), ScanTrajectory.load(weights)
         self._source, self._map = KeyScans(), ScanMap()
         self._covariances = [np.zeros((3, 3))]
-        self.pose_xyyaw = self._first
+        self.pose_xyyaw, self.stamp_ns = self._first, 0
 
     def take(self, sight: Sight) -> None:
         """Take what was measured, in order of time."""
@@ -42,7 +42,12 @@ class OwnPoses:
             update = self._online.update(step)
             self._covariances.append(update.covariance)
             self._map.take(step, self._source.scans(step))
-            self.pose_xyyaw = compose(self._first, update.pose_xyyaw)
+            self.pose_xyyaw, self.stamp_ns = compose(self._first, update.pose_xyyaw), step.stamp_ns
+
+    @property
+    def deviation_m(self) -> float:
+        """Standard deviation of the position now."""
+        return float(np.sqrt(max(0.0, np.linalg.eigvalsh(self._covariances[-1][:2, :2])[-1])))
 
     def cells(self) -> OccupancyMap:
         """The map so far, of all scans at the poses that are known now."""

@@ -61,6 +61,9 @@ def test_a_room_behind_a_gap_too_narrow_is_named_with_the_reason() -> None:
     exploration, _, _ = explore(narrow, (1.0, 1.4), ExplorerConfig(radius_m=0.2, frontier_m=0.2, reach_m=1.0))
     assert exploration.unreachable
     assert all(left.point_xy[0] > 1.6 and left.reason for left in exploration.unreachable)
+    assert not exploration.candidates and exploration.unreachable == exploration.left()
+    ended, _, _ = explore(narrow, (1.0, 1.4), ExplorerConfig(radius_m=0.2, frontier_m=2.0, reach_m=1.0))
+    assert {left.reason for left in ended.left()} == {"it is shorter than frontier_m"}, "named too"
 
 
 def test_the_far_end_of_a_room_that_it_cannot_enter_is_looked_at_through_its_door() -> None:
@@ -153,3 +156,21 @@ def test_a_robot_that_does_not_move_backs_up_and_is_stuck_at_last() -> None:
     assert follower.state == STUCK and min(speeds) < 0.0 < max(speeds)
     follower.stop()
     assert follower.state == ARRIVED and follower.step(exploration.known, robot, 99.0)[0] == 0.0
+
+
+def test_poses_that_come_late_change_nothing_where_the_robot_moves_as_it_is_told() -> None:
+    exploration, _, start = looking(ExplorerConfig(radius_m=0.2))
+    goal = exploration.decide(start, 0.0)
+    assert goal is not None
+    ways = []
+    for late in (0, 3):
+        follower, way = PathFollower(DriveConfig(), exploration.need_m), [start] * (late + 1)
+        follower.follow(goal.path, 0.0)
+        for step in range(60):
+            speed, turn_rate = follower.step(exploration.known, way[-1 - late], 0.1 * step, 0.1 * late)
+            arc = np.array((speed * np.sinc(0.05 * turn_rate / math.pi), 0.0, turn_rate))
+            heading = way[-1][2] + 0.05 * turn_rate
+            way.append(way[-1] + 0.1 * arc[[0, 0, 2]] * (math.cos(heading), math.sin(heading), 1.0))
+        ways.append(np.array(way[late:]))
+    assert np.hypot(*(ways[0][-1] - start)[:2]) > 1.0
+    np.testing.assert_allclose(*ways, atol=1e-9)

@@ -14,6 +14,7 @@ from ngo_explorer.frontiers import Candidate, Frontier, FrontierFinder, viewpoin
 from ngo_explorer.known_map import Floats, KnownMap
 from ngo_explorer.planner import cost_field, plan_path
 from ngo_explorer.put_aside import PutAside
+from ngo_explorer.revisits import Revisits
 from ngo_explorer.rules import Situation, make_rule
 from ngo_explorer.settings import ExplorerConfig
 
@@ -26,7 +27,10 @@ _EXPLORE_LITE = (0.75, 30.0, 1.0 / 0.15)  # its smallest frontier, time without 
 
 @dataclass(frozen=True, eq=False)
 class Goal:
-    """Where to drive: ``pose_xyyaw`` ``(3,)``, along ``path`` ``(n, 2)``. candidate: what is to be seen, None: home."""
+    """Where to drive: ``pose_xyyaw`` ``(3,)``, along ``path`` ``(n, 2)``.
+
+    candidate: what is to be seen; None: nothing new, as at home and where the robot goes back to.
+    """
 
     pose_xyyaw: Floats
     path: Floats
@@ -34,8 +38,8 @@ class Goal:
 
 
 @dataclass(frozen=True, eq=False)
-class Unreachable:
-    """A frontier that is left: where, and why."""
+class Left:
+    """A frontier that was not visited: where, and why."""
 
     point_xy: Floats
     reason: str
@@ -45,11 +49,17 @@ class Exploration:
     """Chooses goals while the map grows.
 
     Its owner gives it maps (``known``), asks ``decide`` where to drive, and says how that went: ``arrived`` or
-    ``failed``. ``candidates`` and ``unreachable`` are the frontiers of the last decision.
+    ``failed``. ``candidates`` and ``unreachable`` are the frontiers of the last decision that count. ``deviation_m`` is
+    the standard deviation of the robot's position now, as far as its owner knows it, or -1.
     """
 
-    def __init__(self, config: ExplorerConfig, boundary: Floats | None = None, seed: int = 0) -> None:
-        """boundary: ``(n, 2)`` corners of a polygon in the map's frame, outside of which nothing is explored."""
+    def __init__(
+        self, config: ExplorerConfig, boundary: Floats | None = None, seed: int = 0, accurate: bool = False
+    ) -> None:
+        """boundary: ``(n, 2)`` corners of a polygon in the map's frame, outside of which nothing is explored.
+
+        accurate: whether to go back to a place that is known better before ``deviation_m`` gets too large.
+        """
         self._lite = config.rule == "explore_lite"
         if self._lite:
             least, progress, again = _EXPLORE_LITE
@@ -58,11 +68,14 @@ class Exploration:
         self.known = KnownMap(config.radius_m, config.comfort_m)
         self.goal: Goal | None = None
         self.candidates: Sequence[Candidate] = ()
-        self.unreachable: Sequence[Unreachable] = ()
+        self.unreachable: Sequence[Left] = ()
         self._boundary = Boundary(boundary)
         self._finder = FrontierFinder(config.frontier_m, math.inf if self._lite else 2.5, by_cells=self._lite)
         self._rule = make_rule(config, np.random.default_rng(seed))
         self._aside = PutAside()
+        self.deviation_m = -1.0
+        self._revisits = Revisits(config.accurate_m) if accurate else None
+        self._went_back_for: Floats | None = None
         self._trail: list[Floats] = []
         self._decided_s = -math.inf
         self._best_way_m, self._progress_s = math.inf, 0.0
@@ -78,6 +91,12 @@ class Exploration:
         """Known area within the boundary."""
         return self._boundary.known_m2(self.known)
 
+    def left(self) -> list[Left]:
+        """All frontiers of the last decision, those that do not count, too, and why none of them was visited."""
+        waiting = [Left(candidate.frontier.point_xy, "it was not visited yet") for candidate in self.candidates]
+        short = [point for point in self._finder.short_xy if self._boundary.holds(point)]
+        return [*waiting, *self.unreachable, *(Left(point, "it is shorter than frontier_m") for point in short)]
+
     def due(self, robot_xyyaw: Floats, now_s: float) -> bool:
         """Whether it is time for a decision: there is no goal, it shows nothing new any more, or time has passed."""
         self._remember(robot_xyyaw[:2])
@@ -92,6 +111,8 @@ class Exploration:
         """Choose where to drive now; None where no frontier is left that can be reached."""
         robot = robot_xyyaw[:2]
         self._remember(robot)
+        if self._revisits is not None and self.deviation_m >= 0.0:
+            self._revisits.note(robot, self.deviation_m)
         self._decided_s = now_s
         before = self.goal.candidate if self.goal is not None else None
         field = cost_field(self.known, robot, self.need_m)
@@ -106,7 +127,8 @@ class Exploration:
             if path is not None:
                 if chosen != present:
                     self._best_way_m, self._progress_s = math.inf, now_s
-                self.goal = Goal(np.array((*candidate.viewpoint_xy, candidate.yaw)), path, candidate)
+                goal = Goal(np.array((*candidate.viewpoint_xy, candidate.yaw)), path, candidate)
+                self.goal = self._revisit(robot_xyyaw, field, candidate) or goal
                 return self.goal
             self._drop(candidate, "no path is wide enough")
         self.goal = None
@@ -118,6 +140,21 @@ class Exploration:
         path = plan_path(self.known, field, robot_xyyaw[:2], pose_xyyaw[:2], self.need_m)
         self.goal = None if path is None else Goal(np.array(pose_xyyaw), path, None)
         return self.goal
+
+    def _revisit(self, robot_xyyaw: Floats, field: NDArray[np.int32], candidate: Candidate) -> Goal | None:
+        """The place to go back to before a candidate, once for each; None: it may go on."""
+        seen, before = candidate.frontier.point_xy, self._went_back_for
+        if self._revisits is None or self.deviation_m < 0.0:
+            return None
+        if before is not None and np.hypot(*(seen - before)) < _SAME_GOAL_M:
+            return None
+        place = self._revisits.place(
+            self.known, field, candidate.viewpoint_xy, candidate.way_m, self.deviation_m, self.need_m
+        )
+        if place is None:
+            return None
+        self._went_back_for = seen
+        return self.go_to(robot_xyyaw, np.array((*place, robot_xyyaw[2])))
 
     def arrived(self) -> None:
         """The robot stands at the goal, and the map has what it sees: what is still unknown stays so from there."""
@@ -152,9 +189,10 @@ class Exploration:
                     if len(barred)
                     else "no path leads to where it can be seen"
                 )
-                unreachable.append(Unreachable(frontier.point_xy, reason))
-                continue
-            if place[2] >= config.gain_m2:
+                unreachable.append(Left(frontier.point_xy, reason))
+            elif place[2] < config.gain_m2:
+                unreachable.append(Left(frontier.point_xy, "it shows less of the unknown than gain_m2"))
+            else:
                 candidates.append(Candidate(frontier, *place))
         self.candidates, self.unreachable = candidates, unreachable
 
@@ -167,7 +205,7 @@ class Exploration:
     def _drop(self, candidate: Candidate, reason: str) -> None:
         self._aside.add(self.known, candidate.frontier, candidate.viewpoint_xy, reason)
         self.candidates = [other for other in self.candidates if other is not candidate]
-        self.unreachable = [*self.unreachable, Unreachable(candidate.frontier.point_xy, reason)]
+        self.unreachable = [*self.unreachable, Left(candidate.frontier.point_xy, reason)]
 
     def _present(self, before: Candidate | None) -> int:
         """The index of the candidate that the robot drives to already, -1 where there is none."""

@@ -54,21 +54,23 @@ class FrontierFinder:
     """Finds connected frontiers; ``piece_m`` is the length of the longest, which longer ones are cut to.
 
     With ``by_cells`` their length is their number of cells times the resolution, as explore_lite has it. This is up to
-    1.4 times too short where they lie across the grid.
+    1.4 times too short where they lie across the grid. ``short_xy`` ``(n, 2)`` is a cell of each that is
+    shorter than ``least_m``, of the last map.
     """
 
     def __init__(self, least_m: float, piece_m: float, by_cells: bool = False) -> None:
         self._least_m, self._piece_m, self._by_cells = least_m, piece_m, by_cells
         self._labels = np.zeros(0, np.int32)
+        self.short_xy = np.zeros((0, 2))
 
     def find(self, known: KnownMap) -> list[Frontier]:
-        """All frontiers of a map."""
+        """All frontiers of a map that are long enough."""
         cells = known.frontier_cells()
         if len(self._labels) != known.frontier.size:
             self._labels = np.zeros(known.frontier.size, np.int32)
         longest = int(min(self._piece_m / known.resolution_m, 2**31 - 1))
         order, starts = _connected(cells, known.frontier, self._labels, max(1, longest))
-        found = []
+        found, short = [], []
         columns = known.frontier.shape[1]
         for begin, end in zip(starts[:-1].tolist(), starts[1:].tolist(), strict=True):
             own = order[begin:end]
@@ -76,9 +78,11 @@ class FrontierFinder:
             across = 0.0 if self._by_cells else math.hypot(*np.ptp(at, axis=0).tolist()) + 1.0
             size_m = max(len(own), across) * known.resolution_m
             if size_m < self._least_m:
+                short.append(own[0])
                 continue
             middle = at[np.argmin(np.sum((at - at.mean(axis=0)) ** 2, axis=1))]
             found.append(Frontier(own, known.points(middle[None])[0], size_m))
+        self.short_xy = known.points_of(np.array(short, np.int64))
         return found
 
 

@@ -65,6 +65,10 @@ class KnownMap:
         """``(n, 2)`` the middles x, y of cells ``(n, 2)`` row, column."""
         return self._corner + (cells[:, ::-1] + 0.5) * self.resolution_m
 
+    def points_of(self, indices: NDArray[np.int64]) -> Floats:
+        """``(n, 2)`` the middles x, y of cells by their flat indices ``(n,)``."""
+        return self.points(np.stack(np.divmod(indices, max(1, self.state.shape[1])), axis=1))
+
     def cell(self, point_xy: Floats) -> tuple[int, int]:
         """Row and column of the cell that holds a point; it may be outside of the map."""
         column, row = np.floor((point_xy[:2] - self._corner) / self.resolution_m).astype(int).tolist()

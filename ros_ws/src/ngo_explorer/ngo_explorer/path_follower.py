@@ -15,6 +15,7 @@ _TURN_ON_THE_SPOT_RAD = 0.8
 _FACES_RAD = 0.3  # near enough to the goal's direction
 _BACK_M, _BACK_MPS = 0.3, 0.1
 _MOVED_M, _MOVED_RAD = 0.03, 0.1
+_KEPT_S = 2.0  # poses come no later than this
 _MOST_TRIES = 3  # to come free, before the goal is given up
 
 DRIVING, ARRIVED, STUCK = "driving", "arrived", "stuck"
@@ -36,6 +37,7 @@ class PathFollower:
         self._tries, self._back_left_m = 0, 0.0
         self._moved_at: tuple[Floats, float] | None = None
         self._last_s: float | None = None
+        self._sent: list[tuple[float, float, float]] = []  # times, speeds and turn rates, those of the last seconds
 
     def follow(self, path: Floats, yaw: float, new: bool = True) -> None:
         """Drive along ``path`` ``(n, 2)``, and look along ``yaw`` at its end; ``new``: not the goal of before."""
@@ -47,8 +49,12 @@ class PathFollower:
         """Give the path up; the robot brakes."""
         self._path, self.state = np.zeros((0, 2)), ARRIVED
 
-    def step(self, known: KnownMap, robot_xyyaw: Floats, now_s: float) -> tuple[float, float]:
-        """Speed (m/s) and turn rate (rad/s) from now on; call it at a steady pace."""
+    def step(self, known: KnownMap, robot_xyyaw: Floats, now_s: float, late_s: float = 0.0) -> tuple[float, float]:
+        """Speed (m/s) and turn rate (rad/s) from now on; call it at a steady pace.
+
+        robot_xyyaw: where the robot was ``late_s`` ago. Since then it has moved as it was told.
+        """
+        robot_xyyaw = self._moved_on(robot_xyyaw, now_s - late_s, now_s)
         period_s = 0.0 if self._last_s is None else min(0.5, max(0.0, now_s - self._last_s))
         self._last_s = now_s
         speed, turn_rate = 0.0, 0.0
@@ -60,7 +66,20 @@ class PathFollower:
         self._speed = speed if abs(speed) < abs(self._speed) else _towards(speed, self._speed, change)
         turning = config.turn_acceleration_rps2 * period_s
         self._turn_rate = turn_rate if turn_rate == 0.0 else _towards(turn_rate, self._turn_rate, turning)
+        self._sent = [sent for sent in self._sent if sent[0] > now_s - _KEPT_S]
+        self._sent.append((now_s, self._speed, self._turn_rate))
         return self._speed, self._turn_rate
+
+    def _moved_on(self, robot: Floats, since_s: float, now_s: float) -> Floats:
+        """A pose, carried on by what was sent: one arc a command."""
+        x, y, yaw = robot.tolist()
+        ends_s = [*(sent[0] for sent in self._sent[1:]), now_s]
+        for (begin_s, speed, turn_rate), end_s in zip(self._sent, ends_s, strict=False):
+            lasting_s = max(0.0, end_s - max(begin_s, since_s))
+            way, half = speed * lasting_s, 0.5 * turn_rate * lasting_s
+            way *= math.sin(half) / half if half else 1.0
+            x, y, yaw = x + way * math.cos(yaw + half), y + way * math.sin(yaw + half), yaw + 2.0 * half
+        return np.array((x, y, yaw))
 
     def _wanted(self, known: KnownMap, robot: Floats, now_s: float, period_s: float) -> tuple[float, float]:
         if self._back_left_m > 0.0:

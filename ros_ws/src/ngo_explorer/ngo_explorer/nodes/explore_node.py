@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import sys
 import time
+from collections import Counter
 from typing import Any
 
 import numpy as np
@@ -130,22 +131,27 @@ class ExploreNode(Node):
         self._told_s = -math.inf
 
     def _renew(self) -> None:
-        self._exploration, self._pilot = Exploration(self._config, _boundary(self._request)), None
+        accurate = self._request.mode == Explore.Goal.ACCURATE
+        self._exploration, self._pilot = Exploration(self._config, _boundary(self._request), accurate=accurate), None
 
     def _end(self, why: str) -> None:
         self._halt()
         exploration = self._exploration
         result = Explore.Result(ended=why, area=exploration.area_m2, path_length=self._path_m)
-        for left in exploration.unreachable:
+        for left in exploration.left():
             result.unreachable.append(Point(x=float(left.point_xy[0]), y=float(left.point_xy[1])))
             result.reasons.append(left.reason)
         self._active = False
         exploration.goal = None
-        self._markers.publish(frontier_markers(exploration, self._frame, self.get_clock().now().to_msg()))
+        stamp = self.get_clock().now().to_msg()
+        self._markers.publish(frontier_markers(exploration, self._frame, stamp))
+        self._paths.publish(path_message(np.zeros((0, 2)), self._frame, stamp))
         self.get_logger().info(
             f"exploration ended: {why}; {result.area:.1f} m^2 known, path of {self._path_m:.1f} m, "
-            f"{len(result.reasons)} frontiers cannot be reached"
+            f"{len(result.reasons)} frontiers left"
         )
+        for reason, count in Counter(result.reasons).most_common():
+            self.get_logger().info(f"left {count} x: {reason}")
         self._ended.set_result(result)
 
     # Stepping.
@@ -186,14 +192,14 @@ class ExploreNode(Node):
             self._driver.check()
         elif isinstance(self._driver, PublishedGoals):
             self._driver.look(pose)
-        decided = self._pilot.decided
+        decided, exploration.deviation_m = self._pilot.decided, self._input.deviation_m
         self._pilot.step(pose, now_s)
         if self._pilot.decided > decided or time.monotonic() - self._told_s > _FEEDBACK_S:
             self._tell()
         if self._pilot.state == DONE:
             self._end(Explore.Result.COMPLETE)
         elif isinstance(self._driver, PathFollower):
-            speed, turn_rate = self._driver.step(exploration.known, pose, now_s)
+            speed, turn_rate = self._driver.step(exploration.known, pose, now_s, self._input.late_s(now_s))
             self._send_velocity(speed, turn_rate)
 
     def _doubtful(self, doubt: str, pose: Floats | None) -> None:

@@ -41,11 +41,9 @@ def frontier_markers(exploration: Exploration, frame: str, stamp: Time) -> Marke
     size = max(exploration.known.resolution_m, 0.02)
     markers = [Marker(header=header, action=Marker.DELETEALL)]
     chosen = exploration.goal.candidate if exploration.goal is not None else None
-    columns = max(1, exploration.known.frontier.shape[1]) if not exploration.known.empty else 1
     for number, candidate in enumerate(exploration.candidates):
-        cells = np.stack(np.divmod(candidate.frontier.cells, columns), axis=1)
         color = _GREEN if candidate is chosen else _BLUE
-        markers.append(_cells(header, number, exploration.known.points(cells), size, color))
+        markers.append(_cells(header, number, exploration.known.points_of(candidate.frontier.cells), size, color))
     if exploration.unreachable:
         points = np.array([left.point_xy for left in exploration.unreachable])
         markers.append(_cells(header, len(markers), points, 3.0 * size, _RED))

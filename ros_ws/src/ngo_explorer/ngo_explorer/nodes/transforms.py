@@ -14,29 +14,34 @@ Pose = NDArray[np.float64]
 
 
 class TransformTree:
-    """Who is whose parent, and where in it: x, y and yaw, whatever else a transform says."""
+    """Who is whose parent, where in it and since when: x, y and yaw, whatever else a transform says."""
 
     def __init__(self) -> None:
-        self._parents: dict[str, tuple[str, Pose]] = {}
+        self._parents: dict[str, tuple[str, Pose, float]] = {}
 
-    def take(self, message: TFMessage) -> None:
-        """Take the transforms of a message; those that are not finite are left out."""
+    def take(self, message: TFMessage, static: bool = False) -> None:
+        """Take the transforms of a message; those that are not finite are left out. ``static``: they have no time."""
         for placed in message.transforms:
             moved = placed.transform.translation
             pose = np.array((moved.x, moved.y, yaw_of(placed.transform.rotation)))
+            stamp = placed.header.stamp
+            stamp_s = 0.0 if static else stamp.sec + 1e-9 * stamp.nanosec
             if np.isfinite(pose).all():
-                self._parents[placed.child_frame_id.lstrip("/")] = placed.header.frame_id.lstrip("/"), pose
+                self._parents[placed.child_frame_id.lstrip("/")] = placed.header.frame_id.lstrip("/"), pose, stamp_s
 
-    def pose(self, frame: str, child: str) -> Pose | None:
-        """Pose ``(3,)`` of a frame in one of those above it; None where they are not joined."""
-        found = np.zeros(3)
+    def pose(self, frame: str, child: str) -> tuple[Pose, float] | None:
+        """Pose ``(3,)`` of a frame in one of those above it, and when it was there; None where they are not joined.
+
+        The time is that of the lowest transform that has one, in s: what lies above it moves seldom. 0: none has.
+        """
+        found, found_s = np.zeros(3), 0.0
         for _ in range(_LONGEST):
             if child == frame:
-                return found
+                return found, found_s
             if child not in self._parents:
                 return None
-            child, pose = self._parents[child]
-            found = _composed(pose, found)
+            child, pose, stamp_s = self._parents[child]
+            found, found_s = _composed(pose, found), found_s or stamp_s
         return None
 
 

@@ -30,6 +30,7 @@ class WorldInput:
         self._tree = TransformTree()
         self._heard_s = -math.inf
         self._pose: Floats | None = None
+        self._pose_s = 0.0  # by its stamp
         self.deviation_m = -1.0
         """Standard deviation of the position; -1 where nobody says it."""
         self._lost = ""
@@ -40,7 +41,7 @@ class WorldInput:
         node.create_subscription(OccupancyGrid, settings.map_topic, self._on_map, latched)
         node.create_subscription(OccupancyGridUpdate, settings.map_topic + "_updates", self._on_update, 10)
         node.create_subscription(TFMessage, "/tf", self._on_tf, 100)
-        node.create_subscription(TFMessage, "/tf_static", self._tree.take, static)
+        node.create_subscription(TFMessage, "/tf_static", lambda message: self._tree.take(message, static=True), static)
         node.create_subscription(PoseWithCovarianceStamped, settings.pose_topic, self._on_pose, 10)
         node.create_subscription(DiagnosticArray, settings.diagnostics_topic, self._on_diagnostics, 10)
 
@@ -55,6 +56,11 @@ class WorldInput:
         if time.monotonic() - self._heard_s > self._settings.pose_timeout_s:
             return None
         return self._pose
+
+    def late_s(self, now_s: float) -> float:
+        """How old the pose is by its stamp; 0 where that is more than a pose may be: then it is of another clock."""
+        late_s = now_s - self._pose_s
+        return late_s if 0.0 < late_s < self._settings.pose_timeout_s else 0.0
 
     @property
     def doubt(self) -> str:
@@ -98,10 +104,10 @@ class WorldInput:
     def _on_tf(self, message: TFMessage) -> None:
         self._tree.take(message)
         settings = self._settings
-        pose = self._tree.pose(settings.framed(settings.map_frame), settings.framed(settings.base_frame))
+        found = self._tree.pose(settings.framed(settings.map_frame), settings.framed(settings.base_frame))
         # The base's own branch tells that the robot is heard of: map -> odom may come seldom.
-        if pose is not None:
-            self._pose, self._heard_s = pose, time.monotonic()
+        if found is not None:
+            (self._pose, self._pose_s), self._heard_s = found, time.monotonic()
 
     def _on_pose(self, message: PoseWithCovarianceStamped) -> None:
         covariance = np.array(message.pose.covariance).reshape(6, 6)[:2, :2]
