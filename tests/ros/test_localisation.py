@@ -1,6 +1,6 @@
 """A node that is switched on within a saved map finds its pose there, and says so until it has.
 
-With mode:=localization the map stays as it is, with state_mode:=relocalise it grows from there.
+With mode:=localization the map stays as it is, with map_changes:=learn or state_mode:=relocalise it grows from there.
 """
 
 import dataclasses
@@ -140,6 +140,36 @@ def test_another_start_is_found_in_the_loaded_map_which_then_grows(mapped: Mappe
         assert probe.call(Reset, "ngo_node/reset", Reset.Request()).message == f"forgot {frames} poses"
         node.publish(later[0])
         assert np.hypot(*_planar(node.wait_for_stamp(_stamp_ns(later[0])))[:2]) < 0.5
+        process.send(signal.SIGINT)
+        assert process.wait() == 0, process.log
+        assert "Traceback" not in process.log, process.log
+
+
+def test_a_map_that_learns_grows_from_where_the_robot_is_and_outlives_a_reset(mapped: Mapped) -> None:
+    parameters = {**mapped.parameters, "mode": "localization", "map_changes": "learn", "state": "maze"}
+    again, third = ([_later(message, hours) for message in mapped.steps] for hours in (3, 4))
+    with Probe() as probe, NodeProcess("ngo_estimator", "ngo_node", parameters) as process:
+        node = Node(process, WEIGHTS / "maze2d", probe)
+        node.publish(*again)
+        assert _planar(node.wait_for_stamp(_stamp_ns(again[-1]))) == pytest.approx(mapped.expected, abs=0.03)
+        process.wait_for_log("the loaded map grows from here")
+        frames = mapped.frames + len(node.poses)
+        response = probe.call(SaveState, "ngo_node/save_state", SaveState.Request(path="learnt"))
+        assert response.success and response.message.startswith(f"wrote {frames} poses"), response
+        assert probe.call(Reset, "ngo_node/reset", Reset.Request()).message == "forgot the pose in the map"
+        node.wait_for_problem("not localised")
+        known = len(node.poses)
+        node.publish(*third)
+        assert _planar(node.wait_for_stamp(_stamp_ns(third[-1]))) == pytest.approx(mapped.expected, abs=0.03)
+        node.wait_for_value("frames", str(frames + len(node.poses) - known).__eq__)
+        publisher = probe.node.create_publisher(PoseWithCovarianceStamped, "initialpose", 10)
+        probe.spin_until(lambda: publisher.get_subscription_count() == 1, "ngo_node's subscription of initialpose")
+        given = np.array((1.0, 2.0, 0.5))
+        publisher.publish(pose_message(1, "map", given, np.diag((0.1, 0.1, 0.05))))
+        process.wait_for_log("the robot is at x 1.000 m, y 2.000 m, yaw 0.500 rad, as it was told")
+        fourth = _later(mapped.steps[0], 5)
+        node.publish(fourth)
+        assert np.hypot(*(_planar(node.wait_for_stamp(_stamp_ns(fourth))) - given)[:2]) < 0.5
         process.send(signal.SIGINT)
         assert process.wait() == 0, process.log
         assert "Traceback" not in process.log, process.log

@@ -46,7 +46,7 @@ One robot patrols each of {settings[years]} buildings of the {settings[split]} s
 {settings[year_scans]} scans of 360 rays, ten a second. Before each drive one piece in twenty of the furniture of rooms
 and halls is moved within its room; doors move and people walk all the time. Each drive begins at an unknown place with
 another odometry: the state that was saved is loaded, the robot is looked for in it, and the map grows from there, as
-with `state_mode:=relocalise`.
+with `map_changes:=learn`.
 
 - Error: root mean square distance of the drive's positions, from where the robot was found on, after the best rigid
   motion. A drive in which the robot was never found has none.

@@ -69,6 +69,13 @@ def test_frames_that_would_coincide_and_a_short_queue_are_errors() -> None:
         NgoNodeSettings(window_frames=3000)
 
 
+def test_a_saved_map_learns_in_localization_alone() -> None:
+    with pytest.raises(BadParameter, match="'map_changes' is 'learn'; allowed: ignore, with mode mapping"):
+        NgoNodeSettings(map_changes="learn")
+    kept, learns = (NgoNodeSettings(mode="localization", state="s", map_changes=value) for value in ("ignore", "learn"))
+    assert kept.keeps_map and not learns.keeps_map
+
+
 def test_a_view_serves_its_page_and_its_data_from_two_ports() -> None:
     with pytest.raises(BadParameter, match="'data_port' is 9090; allowed: another port than web_port"):
         ViewNodeSettings(data_port=9090)

@@ -18,6 +18,7 @@ from ngo_estimator.trajectory.g2o import GRAPH_ENDING, g2o_lines, write_g2o
 from ngo_estimator.trajectory.save_path import folder_inside, path_inside
 
 if TYPE_CHECKING:
+    from ngo_estimator.nodes.settings import NgoNodeSettings
     from ngo_estimator.slam.joining import Joining
     from ngo_estimator.slam.map_localisation import MapLocalisation
     from ngo_estimator.slam.session import Session
@@ -38,8 +39,7 @@ class FileServices:
     def __init__(
         self,
         node: Node,
-        folder: str,
-        localises: bool,
+        settings: "NgoNodeSettings",
         trajectory: "Callable[[], Trajectory | None]",
         graph: "Callable[[], PlanarGraph | None]",
         session: "Callable[[], Session]",
@@ -47,10 +47,10 @@ class FileServices:
     ) -> None:
         """Save ``trajectory()``, ``graph()`` and ``session()``, and hand a loaded session to ``take``.
 
-        Paths lie in ``folder``. With a session comes the search for the robot in its map: if the node ``localises``, or
-        the session goes on from another start.
+        Paths lie in the folder of the ``settings``. With a session comes the search for the robot in its map: if they
+        say localization, or the session goes on from another start.
         """
-        self._node, self._folder, self._localises = node, Path(folder), localises
+        self._node, self._settings, self._folder = node, settings, Path(settings.save_directory)
         self._trajectory, self._graph, self._session, self._take = trajectory, graph, session, take
 
     def open(self, qos: QoSProfile, built: ExitStack) -> None:
@@ -74,9 +74,9 @@ class FileServices:
 
     def _loaded(self, present: "Session", folder: Path, relocalise: bool) -> "Loaded":
         session = present.loaded(folder)
-        if self._localises:
+        if self._settings.keeps_map:
             return session, session.localisation()
-        return session, session.joining() if relocalise else None
+        return session, session.joining() if relocalise or self._settings.mode == "localization" else None
 
     async def _on_save_trajectory(
         self, request: SaveTrajectory.Request, response: SaveTrajectory.Response

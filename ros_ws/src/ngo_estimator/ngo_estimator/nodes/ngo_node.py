@@ -57,8 +57,9 @@ _SUMMARY = "Publishes the corrected trajectory and map -> odom from relative pos
 class NgoNode(ManagedNode):
     """Subscribes relative poses; publishes the corrected trajectory in several forms, and map -> odom.
 
-    With ``mode`` localization the trajectory is the one that was saved and stays so: it is the map in which the robot's
-    pose is looked for. A session that goes on from another start is such a map until the robot is found.
+    With ``mode`` localization the trajectory is the one that was saved: it is the map in which the robot's pose is
+    looked for. It stays so, or with ``map_changes`` learn until the robot is found, as a session that goes on from
+    another start.
 
     With ``robots`` there are several streams of relative poses, and one trajectory (``RobotFleet``).
 
@@ -113,8 +114,7 @@ class NgoNode(ManagedNode):
         built.callback(setattr, self, "_configured", False)
         files = FileServices(
             self,
-            settings.save_directory,
-            settings.mode == "localization",
+            settings,
             self._trajectory,
             self._graph,
             self._session,
@@ -122,7 +122,7 @@ class NgoNode(ManagedNode):
         )
         if settings.state:
             try:
-                files.load_at_start(settings.state, settings.state_mode == "relocalise")
+                files.load_at_start(settings.state, settings.looks_again)
             except ValueError as error:
                 raise StartError(f"state: {error}") from error
         files.open(_SERVICES, built)
@@ -250,7 +250,7 @@ class NgoNode(ManagedNode):
 
     def _look_again(self, step: "RelativeStep") -> None:
         """Keep the map where the odometry begins anew, if the robot is to be found in it."""
-        if self._settings.state_mode != "relocalise" or self._search is not None or not self._core.begins_anew(step):
+        if not self._settings.looks_again or self._search is not None or not self._core.begins_anew(step):
             return
         with contextlib.suppress(ValueError):  # a map that shows no places yet
             if not self._paused and (update := self._core.finish()) is not None:
@@ -357,6 +357,8 @@ class NgoNode(ManagedNode):
             return
         x, y, yaw = given[0].tolist()
         there = f"the robot is at x {x:.3f} m, y {y:.3f} m, yaw {yaw:.3f} rad"
+        if self._search is None and self._settings.mode == "localization":
+            self._look_for_the_robot(self._session().joining())
         if self._search is not None:
             self._search.set_pose(*given)
             self._out.smoothing.reset()
@@ -390,7 +392,7 @@ class NgoNode(ManagedNode):
 
     def _on_reset(self, _: Reset.Request, response: Reset.Response) -> Reset.Response:
         frames = 0 if self._latest is None else self._latest.frames
-        in_map = self._settings.mode == "localization" and self._search is not None
+        in_map = self._settings.mode == "localization"
         if not in_map:
             self._search = None
         self._forget()
@@ -399,15 +401,17 @@ class NgoNode(ManagedNode):
 
     def _forget(self) -> None:
         """Begin a new trajectory; in a saved map, which stays, look for the pose anew."""
-        if self._search is None:
+        if self._search is None and self._settings.mode == "localization":
+            self._look_for_the_robot(self._session().joining())
+        elif self._search is None:
             self._core.reset()
             self._begin_anew()
-            return
-        self._search.reset()
-        self._out.smoothing.reset()
+        else:
+            self._search.reset()
+            self._out.smoothing.reset()
 
     def _on_pause(self, request: SetBool.Request, response: SetBool.Response) -> SetBool.Response:
-        if self._settings.mode == "localization":
+        if self._settings.keeps_map:
             response.message = "mode is localization, where nothing is corrected that could pause"
             return response
         self._paused = request.data

@@ -231,9 +231,15 @@ class NgoNodeSettings(EstimatorSettings):
     )
     mode: str = setting(
         "mapping",
-        "mapping: the map grows with every relative pose. localization: the map in state stays as it is, and the "
-        "robot's pose is looked for in it.",
+        "mapping: the map grows with every relative pose. localization: the robot's pose is looked for in the map in "
+        "state.",
         choices=("mapping", "localization"),
+    )
+    map_changes: str = setting(
+        "ignore",
+        "With mode localization. ignore: the map stays as it was saved. learn: from where the robot is found, what it "
+        "sees enters the map and replaces what has changed; ~/save_state keeps it.",
+        choices=("ignore", "learn"),
     )
     path_topic: str = topic("ngo/path", "Corrected trajectory.")
     pose_topic: str = topic("ngo/pose", "Corrected newest pose with covariance, after every relative pose.")
@@ -286,11 +292,23 @@ class NgoNodeSettings(EstimatorSettings):
                 raise BadParameter(
                     f"parameter 'state' is ''; allowed: the folder of a saved state, with {name} {value}"
                 )
+        if self.map_changes == "learn" and self.mode != "localization":
+            raise BadParameter("parameter 'map_changes' is 'learn'; allowed: ignore, with mode mapping, which learns")
         if self.relative_pose_depth < self.window_frames:
             raise BadParameter(
                 f"parameter 'relative_pose_depth' is {self.relative_pose_depth}; "
                 f"allowed: at least window_frames, which is {self.window_frames}"
             )
+
+    @property
+    def keeps_map(self) -> bool:
+        """Whether the map in ``state`` stays as it is."""
+        return self.mode == "localization" and self.map_changes == "ignore"
+
+    @property
+    def looks_again(self) -> bool:
+        """Whether the robot is looked for in the map where another odometry begins."""
+        return self.mode == "localization" or self.state_mode == "relocalise"
 
 
 @dataclass(frozen=True)
