@@ -17,6 +17,7 @@ from nav_msgs.msg import MapMetaData, OccupancyGrid
 from ngo_msgs.action import Explore
 from rclpy.action import ActionClient, ActionServer, CancelResponse, GoalResponse
 from rclpy.qos import DurabilityPolicy, QoSProfile
+from sensor_msgs.msg import LaserScan
 from std_msgs.msg import Bool
 from tf2_msgs.msg import TFMessage
 from visualization_msgs.msg import MarkerArray
@@ -56,6 +57,9 @@ class World:
         node = probe.node
         self._map = node.create_publisher(OccupancyGrid, "map", LATCHED)
         self._updates = node.create_publisher(OccupancyGridUpdate, "map_updates", 10)
+        self.scan_m: float | None = None
+        """What a scan shows all around, where there is one."""
+        self.scans = node.create_publisher(LaserScan, "scan", 1)
         self._tf = node.create_publisher(TFMessage, "/tf", 100)
         node.create_subscription(Twist, "cmd_vel", self._on_velocity, 10)
         self._stepped_s = self._mapped_s = time.monotonic()
@@ -78,6 +82,11 @@ class World:
                 self._tf.publish(
                     TFMessage(transforms=[placed("map", "odom", np.zeros(3)), placed("odom", "base_link", self.pose)])
                 )
+            if self.scan_m is not None:
+                rays = {"angle_min": -3.0, "angle_max": 3.0, "angle_increment": 0.1, "range_max": 9.0}
+                scan = LaserScan(ranges=[self.scan_m] * 61, **rays)
+                scan.header.frame_id, scan.header.stamp = "base_link", self.probe.node.get_clock().now().to_msg()
+                self.scans.publish(scan)
         if now_s - self._mapped_s >= _MAP_S and not self.silent:
             self._mapped_s = now_s
             seen_from(TRUTH, self.known, *self.pose[:2])
@@ -186,6 +195,15 @@ def test_cancel_time_limit_boundary_pause_and_a_robot_that_is_lost(world: World)
         assert bounded.ended == "complete" and bounded.area <= 6.1
         two = Explore.Goal(boundary=Polygon(points=corners[:2]))
         assert not start(world, client, two).accepted and "three or more" in node.log
+
+        world.scan_m = 0.24  # the robot's radius is 0.2 m
+        world.until(lambda: world.scans.get_subscription_count() == 1, "who hears the scans")
+        handle, moved_m, heard = start(world, client, Explore.Goal()), world.moved_m, world.heard
+        world.until(lambda: world.heard > heard + 30, "some velocities")
+        assert world.moved_m < moved_m + 0.05, "the map is free ahead, but the scan is not"
+        world.scan_m = None
+        world.until(handle.cancel_goal_async().done, "the cancel")
+        finish(world, handle)
 
         handle = start(world, client, Explore.Goal())
         lost = DiagnosticStatus(level=DiagnosticStatus.WARN, name="/ngo_node", message="lost: the deviation is 9 m")

@@ -122,7 +122,7 @@ def explore(
     """
     run = _Run(world, seen, estimator)
     exploration = Exploration(config, seed=seed, accurate=accurate)
-    run.drive(exploration, PathFollower(drive, run.need_m(config)), most_s)
+    run.drive(exploration, PathFollower(drive, run.need_m(config), config.touch_m), most_s)
     return run.explored()
 
 
@@ -133,11 +133,12 @@ def drive_known_tour(
     run = _Run(world, seen)
     known = KnownMap(config.radius_m, config.comfort_m)
     known.update(seen.map.values, RESOLUTION_M, seen.map.origin_xy)
-    follower = PathFollower(drive, run.need_m(config))
+    follower = PathFollower(drive, run.need_m(config), config.touch_m)
     for path in known_tour(world, known, run.sight.pose_xyyaw[:2], run.need_m(config)):
         follower.follow(path, float(np.arctan2(*(path[-1] - path[max(0, len(path) - 5)])[::-1])))
         while follower.state == DRIVING and run.sight.time_s < most_s:
             run.look()
+            run.show(follower)
             run.move(*follower.step(known, run.sight.pose_xyyaw, run.sight.time_s))
     run.drive(Exploration(replace(config, rule="nearest")), follower, most_s)
     return run.explored()
@@ -171,6 +172,11 @@ class _Run:
         known_ns = 0 if self._estimator is None else self._estimator.stamp_ns
         return 1e-9 * (self.sight.stamp_ns - known_ns) if known_ns else 0.0
 
+    def show(self, follower: PathFollower) -> None:
+        """Let the follower have the newest scan."""
+        scan = self.sight.scan
+        follower.look(scan.ends[scan.hits].astype(np.float64), self.sight.time_s)
+
     def need_m(self, config: ExplorerConfig) -> float:
         """Clearance that the robot's middle needs."""
         return config.radius_m + config.margin_m + 0.5 * RESOLUTION_M
@@ -188,6 +194,7 @@ class _Run:
             pilot.step(self.pose_xyyaw, self.sight.time_s)
             if pilot.decided > decided:
                 self._decisions_ms.append(1e3 * (time.process_time() - begun_s))
+            self.show(follower)
             self.move(*follower.step(exploration.known, self.pose_xyyaw, self.sight.time_s, self.late_s))
         self._ended = pilot.state == DONE
 

@@ -16,7 +16,7 @@ setup(
         (f"share/{NAME}", ["package.xml"]),
         (f"share/{NAME}/config", sorted(glob("config/*.*"))),
     ],
-    install_requires=["ngo_common", "numba", "numpy"],
+    install_requires=["ngo_common", "ngo_recordings", "numba", "numpy"],
     zip_safe=False,
     maintainer="NGO maintainers",
     maintainer_email="maintainers@ngo.invalid",

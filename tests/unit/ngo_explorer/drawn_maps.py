@@ -34,11 +34,15 @@ def explore(
     start_xy: tuple[float, float],
     config: ExplorerConfig | None = None,
     boundary: np.ndarray | None = None,
+    glass: np.ndarray | None = None,
 ) -> tuple[Exploration, np.ndarray, list[np.ndarray]]:
-    """Explore a map to the end; returns the exploration, what is known then, and where the robot was."""
+    """Explore a map to the end; returns the exploration, what is known then, and where the robot was.
+
+    glass: what its scans show nearby, beside what the map has.
+    """
     exploration = Exploration(config or ExplorerConfig(radius_m=0.2), boundary)
     known = np.full_like(truth, -1)
-    follower = PathFollower(DriveConfig(), 0.3)
+    follower = PathFollower(DriveConfig(), 0.3, 0.225)
     pilot, robot, way = Pilot(exploration, follower, 0.5, None), np.array((*start_xy, 0.0)), []
     for step in range(6000):
         if step % 5 == 0:
@@ -47,6 +51,10 @@ def explore(
         pilot.step(robot, 0.1 * step)
         if pilot.state == DONE:
             return exploration, known, way
+        if glass is not None:
+            x, y = (np.argwhere(glass == 100)[:, ::-1] + 0.5).T * RESOLUTION_M - robot[:2, None]
+            cos, sin = math.cos(robot[2]), math.sin(robot[2])
+            follower.look(np.column_stack((cos * x + sin * y, cos * y - sin * x)), 0.1 * step)
         speed, turn_rate = follower.step(exploration.known, robot, 0.1 * step)
         heading = robot[2] + 0.05 * turn_rate
         robot = robot + 0.1 * np.array((speed * math.cos(heading), speed * math.sin(heading), turn_rate))

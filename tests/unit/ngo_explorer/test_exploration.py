@@ -145,7 +145,7 @@ def test_a_robot_that_does_not_move_backs_up_and_is_stuck_at_last() -> None:
     exploration, _, robot = looking(ExplorerConfig(radius_m=0.2))
     goal = exploration.decide(robot, 0.0)
     assert goal is not None
-    follower = PathFollower(DriveConfig(stuck_s=1.0), exploration.need_m)
+    follower = PathFollower(DriveConfig(stuck_s=1.0), exploration.need_m, 0.22)
     follower.follow(goal.path, 0.0)
     robot[2] = math.atan2(*(goal.path[5] - goal.path[0])[::-1])
     speeds = []
@@ -164,7 +164,7 @@ def test_poses_that_come_late_change_nothing_where_the_robot_moves_as_it_is_told
     assert goal is not None
     ways = []
     for late in (0, 3):
-        follower, way = PathFollower(DriveConfig(), exploration.need_m), [start] * (late + 1)
+        follower, way = PathFollower(DriveConfig(), exploration.need_m, 0.22), [start] * (late + 1)
         follower.follow(goal.path, 0.0)
         for step in range(60):
             speed, turn_rate = follower.step(exploration.known, way[-1 - late], 0.1 * step, 0.1 * late)
@@ -174,3 +174,16 @@ def test_poses_that_come_late_change_nothing_where_the_robot_moves_as_it_is_told
         ways.append(np.array(way[late:]))
     assert np.hypot(*(ways[0][-1] - start)[:2]) > 1.0
     np.testing.assert_allclose(*ways, atol=1e-9)
+
+
+def test_a_pane_that_the_map_does_not_show_is_not_touched_and_the_end_is_reached() -> None:
+    glass = ROOMS.copy()
+    glass[40:50, 62] = 100  # a pane across the passage to the right, that rays of the map pass through
+    exploration, known, way = explore(ROOMS, START, glass=glass)
+    cells = np.argwhere((glass == 100) & (ROOMS == 0))
+    gaps = np.hypot(*((cells[:, ::-1] + 0.5) * RESOLUTION_M - np.array(way)[:, None, :2]).transpose(2, 0, 1)).min(
+        axis=1
+    )
+    assert gaps.min() > 0.2
+    assert np.array(way)[:, 0].max() < 6.2 and (known[40:50, 60:70] == 0).all()
+    assert exploration.left(), "what lies behind it is named"

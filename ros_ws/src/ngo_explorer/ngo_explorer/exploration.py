@@ -73,6 +73,7 @@ class Exploration:
         self._finder = FrontierFinder(config.frontier_m, math.inf if self._lite else 2.5, by_cells=self._lite)
         self._rule = make_rule(config, np.random.default_rng(seed))
         self._aside = PutAside()
+        self._may_forget = True
         self.deviation_m = -1.0
         self._revisits = Revisits(config.accurate_m) if accurate else None
         self._went_back_for: Floats | None = None
@@ -164,8 +165,12 @@ class Exploration:
             self._aside.add(self.known, goal.candidate.frontier, goal.candidate.viewpoint_xy, reason, again=True)
 
     def another_chance(self) -> bool:
-        """Before the end: whether something failed only once, which then may be tried again."""
-        return not self._lite and self._aside.another_chance()
+        """Before the end: whether something failed only once, or was barred by what may be gone. It is tried again."""
+        if self._lite:
+            return False
+        gone = self._may_forget and self.known.forget_marks() and len(self.unreachable) > 0
+        self._may_forget = False
+        return self._aside.another_chance() or gone
 
     def failed(self, reason: str) -> None:
         """The robot could not get to the goal."""

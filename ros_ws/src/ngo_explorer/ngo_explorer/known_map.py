@@ -17,6 +17,7 @@ UNKNOWN, FREE, OCCUPIED = -1, 0, 1
 Floats = NDArray[np.float64]
 Cells = NDArray[np.int8]
 
+_NEAR_CELLS = 3.0  # an obstacle that is this near in the map is the same
 _TILE = 64  # cells along the side of a tile, at least
 
 
@@ -37,6 +38,7 @@ class KnownMap:
             raise ValueError(f"radius_m is {radius_m}; expected a positive length")
         self.radius_m, self.comfort_m = radius_m, max(comfort_m, radius_m)
         self.resolution_m = 0.0
+        self._marked = np.zeros((0, 2))
         self.changes = 0
         """Counts the updates that changed anything."""
 
@@ -61,6 +63,21 @@ class KnownMap:
         placed[inside, across] = values
         return self._take(placed)
 
+    def mark(self, points_xy: Floats) -> None:
+        """Take points ``(n, 2)`` that the map has nothing near for occupied, whatever it says of them later."""
+        rows, columns = self._cells(points_xy).T
+        inside = (rows >= 0) & (rows < self.state.shape[0]) & (columns >= 0) & (columns < self.state.shape[1])
+        points_xy, rows, columns = points_xy[inside], rows[inside], columns[inside]
+        new = points_xy[self.clearance_m[rows, columns] > _NEAR_CELLS * self.resolution_m]
+        if len(new):
+            self._marked = np.vstack((self._marked, new))
+            self._take(np.where(self.state == OCCUPIED, 100, self.state).astype(np.int8))
+
+    def forget_marks(self) -> bool:
+        """Forget what was marked; the next update lets the map have its say. Returns whether there was anything."""
+        found, self._marked = len(self._marked) > 0, np.zeros((0, 2))
+        return found
+
     def points(self, cells: NDArray[np.int64]) -> Floats:
         """``(n, 2)`` the middles x, y of cells ``(n, 2)`` row, column."""
         return self._corner + (cells[:, ::-1] + 0.5) * self.resolution_m
@@ -71,8 +88,11 @@ class KnownMap:
 
     def cell(self, point_xy: Floats) -> tuple[int, int]:
         """Row and column of the cell that holds a point; it may be outside of the map."""
-        column, row = np.floor((point_xy[:2] - self._corner) / self.resolution_m).astype(int).tolist()
+        row, column = self._cells(point_xy[:2]).tolist()
         return row, column
+
+    def _cells(self, points_xy: Floats) -> NDArray[np.int64]:
+        return np.asarray(np.floor((points_xy - self._corner) / self.resolution_m).astype(np.int64)[..., ::-1])
 
     @property
     def known_m2(self) -> float:
@@ -134,6 +154,8 @@ class KnownMap:
         self._corner = self._anchor + np.array((low[1], low[0])) * self.resolution_m
 
     def _take(self, values: NDArray[np.int8]) -> bool:
+        if len(self._marked):
+            values[tuple(self._cells(self._marked).T)] = 100
         tile, changed = self._tile, np.zeros(self._known.shape, np.bool_)
         _write(self.state, values, tile, changed)
         if not changed.any():

@@ -15,6 +15,7 @@ _TURN_ON_THE_SPOT_RAD = 0.8
 _FACES_RAD = 0.3  # near enough to the goal's direction
 _BACK_M, _BACK_MPS = 0.3, 0.1
 _MOVED_M, _MOVED_RAD = 0.03, 0.1
+_SEEN_M = 1.0  # hits of a scan that are nearer may stop the robot
 _KEPT_S = 2.0  # poses come no later than this
 _MOST_TRIES = 3  # to come free, before the goal is given up
 
@@ -27,9 +28,9 @@ class PathFollower:
     ``state`` is DRIVING, ARRIVED at the goal, or STUCK: it backed up several times in vain.
     """
 
-    def __init__(self, config: DriveConfig, need_m: float) -> None:
-        """need_m: clearance that the robot's middle needs."""
-        self.config, self._need_m = config, need_m
+    def __init__(self, config: DriveConfig, need_m: float, touch_m: float) -> None:
+        """need_m: clearance that the robot's middle needs in the map. touch_m: from what its newest scan shows."""
+        self.config, self._need_m, self._touch_m = config, need_m, touch_m
         self.state = ARRIVED
         self._path, self._goal_yaw = np.zeros((0, 2)), 0.0
         self._speed = self._turn_rate = 0.0
@@ -37,6 +38,7 @@ class PathFollower:
         self._tries, self._back_left_m = 0, 0.0
         self._moved_at: tuple[Floats, float] | None = None
         self._last_s: float | None = None
+        self._hits, self._hits_s = np.zeros((0, 2)), 0.0
         self._sent: list[tuple[float, float, float]] = []  # times, speeds and turn rates, those of the last seconds
 
     def follow(self, path: Floats, yaw: float, new: bool = True) -> None:
@@ -48,6 +50,13 @@ class PathFollower:
     def stop(self) -> None:
         """Give the path up; the robot brakes."""
         self._path, self.state = np.zeros((0, 2)), ARRIVED
+
+    def look(self, hits_xy: Floats, seen_s: float) -> None:
+        """Take the hits ``(n, 2)`` of the newest scan, in the robot's frame when it was taken.
+
+        The map may lack what they show: panes that most rays pass through, people, doors that were open.
+        """
+        self._hits, self._hits_s = hits_xy[np.hypot(*hits_xy.T) < _SEEN_M], seen_s
 
     def step(self, known: KnownMap, robot_xyyaw: Floats, now_s: float, late_s: float = 0.0) -> tuple[float, float]:
         """Speed (m/s) and turn rate (rad/s) from now on; call it at a steady pace.
@@ -64,6 +73,9 @@ class PathFollower:
         change = config.acceleration_mps2 * period_s
         # Braking is not limited: the base does that, and a softer stop would run into what is ahead.
         self._speed = speed if abs(speed) < abs(self._speed) else _towards(speed, self._speed, change)
+        if self._speed and self._would_touch(now_s):
+            self._speed = 0.0
+            known.mark(_placed(robot_xyyaw, self._hits_now(now_s)))
         turning = config.turn_acceleration_rps2 * period_s
         self._turn_rate = turn_rate if turn_rate == 0.0 else _towards(turn_rate, self._turn_rate, turning)
         self._sent = [sent for sent in self._sent if sent[0] > now_s - _KEPT_S]
@@ -129,18 +141,36 @@ class PathFollower:
 
     def _arc_is_free(self, known: KnownMap, robot: Floats, speed: float, turn_rate: float) -> bool:
         """Whether the way until it could stop is free, half a second on."""
-        stop_s = 0.5 + speed / (2.0 * self.config.acceleration_mps2)
-        x, y, yaw = robot.tolist()
-        need = self._need_m - 0.5 * known.resolution_m
-        before = np.array((x, y))
-        for step in range(1, 5):
-            turn, way = turn_rate * stop_s * step / 4, speed * stop_s * step / 4
-            heading = yaw + turn / 2
-            there = np.array((x + way * math.cos(heading), y + way * math.sin(heading)))
+        need, before = self._need_m - 0.5 * known.resolution_m, robot
+        for there in _placed(robot, self._ahead(speed, turn_rate)):
             if not line_is_free(known, before, there, need):
                 return False
             before = there
         return True
+
+    def _ahead(self, speed: float, turn_rate: float) -> Floats:
+        """Points ``(4, 2)`` of the way until it could stop, half a second on, in the robot's frame."""
+        stop_s = 0.5 + abs(speed) / (2.0 * self.config.acceleration_mps2)
+        times = stop_s * np.arange(1, 5) / 4
+        headings = turn_rate * times / 2
+        return np.column_stack((speed * times * np.cos(headings), speed * times * np.sin(headings)))
+
+    def _would_touch(self, now_s: float) -> bool:
+        """Whether the way until it could stop comes nearer to two hits of the newest scan; one alone may be noise."""
+        hits = self._hits_now(now_s)
+        if len(hits) < 2:
+            return False
+        way = np.vstack((np.zeros(2), self._ahead(self._speed, self._turn_rate)))
+        gaps = np.partition(np.hypot(*(hits - way[:, None]).transpose(2, 0, 1)), 1, axis=1)[:, 1]
+        return bool(np.any(gaps[1:] < min(self._touch_m, gaps[0] - 0.01)))
+
+    def _hits_now(self, now_s: float) -> Floats:
+        """The hits in the robot's frame of now: it has moved on. Those of a scanner that has fallen silent are gone."""
+        if now_s - self._hits_s > _KEPT_S:
+            return np.zeros((0, 2))
+        moved = self._moved_on(np.zeros(3), self._hits_s, now_s)
+        cos, sin = math.cos(moved[2]), math.sin(moved[2])
+        return np.asarray((self._hits - moved[:2]) @ np.array(((cos, -sin), (sin, cos))))
 
     def _face(self, robot: Floats) -> tuple[float, float]:
         off = math.remainder(self._goal_yaw - robot[2], math.tau)
@@ -174,6 +204,12 @@ class PathFollower:
             self._back_left_m = 0.0
             return 0.0, 0.0
         return -_BACK_MPS, 0.0
+
+
+def _placed(pose: Floats, points: Floats) -> Floats:
+    """Points ``(n, 2)`` seen from a pose ``(3,)``, in its frame."""
+    cos, sin = math.cos(pose[2]), math.sin(pose[2])
+    return np.asarray(pose[:2] + points @ np.array(((cos, sin), (-sin, cos))))
 
 
 def _towards(wanted: float, now: float, change: float) -> float:

@@ -35,6 +35,11 @@ class ExplorerConfig(Settings):
     )
     progress_s: float = setting(15.0, "Time without progress after which a goal is put aside, s.", minimum=1.0)
 
+    @property
+    def touch_m(self) -> float:
+        """Distance from what a scan shows at which the robot stops: half of the margin is left."""
+        return self.radius_m + 0.5 * self.margin_m
+
 
 @dataclass(frozen=True)
 class DriveConfig(Settings):

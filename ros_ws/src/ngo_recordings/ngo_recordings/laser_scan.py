@@ -55,6 +55,14 @@ class LidarScan:
             return self.offsets_s
         return self.time_increment * np.arange(len(self.ranges), dtype=np.float64)
 
+    def hits(self) -> np.ndarray:
+        """Ends ``(n, 2)`` of the rays that met something, in the scanner's frame (m)."""
+        angles, ranges = self.angles, self.ranges.astype(np.float64)
+        hit = np.isfinite(ranges) & (ranges > 0.0) & (ranges >= self.range_min)
+        if self.range_max > self.range_min:  # some drivers leave it at 0
+            hit &= ranges <= self.range_max
+        return ranges[hit, None] * np.column_stack([np.cos(angles[hit]), np.sin(angles[hit])])
+
     @property
     def sweep_s(self) -> float:
         """From the first ray to the last, s; 0 where it is not known."""

@@ -46,6 +46,13 @@ class Mounting:
     height_m: float
     source: str
 
+    def on_robot(self, points: np.ndarray) -> np.ndarray:
+        """Points ``(n, 2)`` of the scan's plane, in the robot's frame."""
+        x, y, yaw = self.base_from_scan_xyyaw.tolist()
+        cos, sin = math.cos(yaw), math.sin(yaw)
+        seen = points * (1.0, -1.0) if self.upside_down else points
+        return np.asarray(seen @ np.array(((cos, sin), (-sin, cos))) + (x, y))
+
     def near(self, other: Mounting) -> bool:
         """Whether another mounting is the same but for rounding and vibration."""
         off = self.base_from_scan_xyyaw - other.base_from_scan_xyyaw

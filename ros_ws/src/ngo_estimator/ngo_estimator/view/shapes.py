@@ -27,17 +27,8 @@ def scan_points(scan: LidarScan, mounting: Mounting | None, pose_xyyaw: np.ndarr
 
     Without a mounting the scanner is taken to sit at the robot's pose, looking ahead.
     """
-    angles = scan.angle_min + scan.angle_increment * np.arange(len(scan.ranges))
-    ranges = scan.ranges.astype(np.float64)
-    hit = np.isfinite(ranges) & (ranges > 0.0) & (ranges >= scan.range_min)
-    if scan.range_max > scan.range_min:  # some drivers leave it at 0
-        hit &= ranges <= scan.range_max
-    xy = ranges[hit, None] * np.column_stack([np.cos(angles[hit]), np.sin(angles[hit])])
-    if mounting is not None:
-        if mounting.upside_down:
-            xy[:, 1] *= -1.0
-        xy = transformed(mounting.base_from_scan_xyyaw, xy)
-    return np.asarray(transformed(pose_xyyaw, xy))
+    hits = scan.hits()
+    return np.asarray(transformed(pose_xyyaw, hits if mounting is None else mounting.on_robot(hits)))
 
 
 def shown_picture(image: np.ndarray) -> np.ndarray:

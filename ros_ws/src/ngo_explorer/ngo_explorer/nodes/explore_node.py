@@ -81,7 +81,7 @@ class ExploreNode(Node):
 
     def _make_driver(self, settings: ExploreNodeSettings) -> PathFollower | Nav2Driver | PublishedGoals:
         if settings.drive == "own":
-            return PathFollower(self._drive, self._config.radius_m + self._config.margin_m)
+            return PathFollower(self._drive, self._config.radius_m + self._config.margin_m, self._config.touch_m)
         if settings.drive == "nav2":
             return Nav2Driver(self, settings.navigate_action, settings.nav2_timeout_s, self._pose_message)
         return PublishedGoals()
@@ -199,6 +199,8 @@ class ExploreNode(Node):
         if self._pilot.state == DONE:
             self._end(Explore.Result.COMPLETE)
         elif isinstance(self._driver, PathFollower):
+            if (hits := self._input.new_hits(now_s)) is not None:
+                self._driver.look(*hits)
             speed, turn_rate = self._driver.step(exploration.known, pose, now_s, self._input.late_s(now_s))
             self._send_velocity(speed, turn_rate)
 

@@ -21,6 +21,7 @@ class ExploreNodeSettings(FramedSettings):
         False, "Whether to explore at once, everywhere and without a limit, as with an empty goal."
     )
     map_topic: str = topic("map", "The occupancy grid. Its changes are taken from the topic with _updates behind.")
+    scan_topic: str = topic("scan", "Laser scan that drive own stops by, where the map lacks what it shows.")
     cmd_vel_topic: str = topic("cmd_vel", "Velocities, with drive own.")
     pose_topic: str = topic("ngo/pose", "Pose with covariance, of which the deviation is taken. The pose comes by TF.")
     diagnostics_topic: str = topic("/diagnostics", "Where localisation_node says whether the robot is lost.")

@@ -11,12 +11,17 @@ from geometry_msgs.msg import PoseWithCovarianceStamped
 from map_msgs.msg import OccupancyGridUpdate
 from nav_msgs.msg import OccupancyGrid
 from rclpy.node import Node
-from rclpy.qos import DurabilityPolicy, QoSProfile
+from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+from sensor_msgs.msg import LaserScan
 from tf2_msgs.msg import TFMessage
 
 from ngo_explorer.known_map import Cells, Floats, KnownMap
 from ngo_explorer.nodes.settings import ExploreNodeSettings
 from ngo_explorer.nodes.transforms import TransformTree, yaw_of
+from ngo_recordings.errors import RecordingError
+from ngo_recordings.laser_scan import scan_of
+from ngo_recordings.mounting import mounting_in
+from ngo_recordings.transform_buffer import TransformBuffer
 
 _LOST = ("lost:", "not localised")  # in the message of a status
 _TURNED_RAD = 1e-3
@@ -28,6 +33,8 @@ class WorldInput:
     def __init__(self, node: Node, settings: ExploreNodeSettings) -> None:
         self._node, self._settings = node, settings
         self._tree = TransformTree()
+        self._mountings = TransformBuffer()
+        self._hits: tuple[Floats, float] | None = None
         self._heard_s = -math.inf
         self._pose: Floats | None = None
         self._pose_s = 0.0  # by its stamp
@@ -41,7 +48,10 @@ class WorldInput:
         node.create_subscription(OccupancyGrid, settings.map_topic, self._on_map, latched)
         node.create_subscription(OccupancyGridUpdate, settings.map_topic + "_updates", self._on_update, 10)
         node.create_subscription(TFMessage, "/tf", self._on_tf, 100)
-        node.create_subscription(TFMessage, "/tf_static", lambda message: self._tree.take(message, static=True), static)
+        node.create_subscription(TFMessage, "/tf_static", self._on_static, static)
+        if settings.drive == "own":
+            newest = QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)
+            node.create_subscription(LaserScan, settings.scan_topic, self._on_scan, newest)
         node.create_subscription(PoseWithCovarianceStamped, settings.pose_topic, self._on_pose, 10)
         node.create_subscription(DiagnosticArray, settings.diagnostics_topic, self._on_diagnostics, 10)
 
@@ -58,9 +68,18 @@ class WorldInput:
         return self._pose
 
     def late_s(self, now_s: float) -> float:
-        """How old the pose is by its stamp; 0 where that is more than a pose may be: then it is of another clock."""
-        late_s = now_s - self._pose_s
-        return late_s if 0.0 < late_s < self._settings.pose_timeout_s else 0.0
+        """How old the pose is by its stamp."""
+        return self._age_s(self._pose_s, now_s)
+
+    def new_hits(self, now_s: float) -> tuple[Floats, float] | None:
+        """Hits ``(n, 2)`` of a new scan in the robot's frame, and of when; None where no new one has come."""
+        hits, self._hits = self._hits, None
+        return None if hits is None else (hits[0], now_s - self._age_s(hits[1], now_s))
+
+    def _age_s(self, stamp_s: float, now_s: float) -> float:
+        """0 where it is more than a pose's may be: then the stamp is of another clock."""
+        age_s = now_s - stamp_s
+        return age_s if 0.0 < age_s < self._settings.pose_timeout_s else 0.0
 
     @property
     def doubt(self) -> str:
@@ -100,6 +119,25 @@ class WorldInput:
             return
         values[rows, message.x : columns] = part.reshape(message.height, message.width)
         self._changed = True
+
+    def _on_static(self, message: TFMessage) -> None:
+        self._tree.take(message, static=True)
+        self._mountings.take(message.transforms, static=True)
+
+    def _on_scan(self, message: LaserScan) -> None:
+        try:
+            scan = scan_of(message, self._settings.scan_topic)
+        except RecordingError as error:
+            self._dropped("a scan", str(error))
+            return
+        base = self._settings.framed(self._settings.base_frame).strip("/")
+        mounting = mounting_in(self._mountings, base, scan.frame_id)
+        if mounting is not None:
+            self._hits = mounting.on_robot(scan.hits()), 1e-9 * scan.stamp_ns
+        elif scan.frame_id == base:
+            self._hits = scan.hits(), 1e-9 * scan.stamp_ns
+        else:
+            self._dropped("a scan", f"/tf_static does not say where {scan.frame_id} sits on {base}")
 
     def _on_tf(self, message: TFMessage) -> None:
         self._tree.take(message)
