@@ -137,13 +137,14 @@ def test_a_session_goes_on_from_another_start_in_one_map(
     at = next(k for k, update in enumerate(updates) if update is not None)
     update = updates[at]
     assert update is not None and update.stamp_ns == steps[at].stamp_ns and not (update.gap or update.restarted)
-    assert at < 0.6 * len(steps) and update.frames == len(first.truth) + 1
+    trajectory, before = core.trajectory(), mapped.trajectory()
+    assert trajectory is not None and before is not None and (np.diff(trajectory.stamps_ns) > 0).all()
+    stays = np.isin(before.stamps_ns, trajectory.stamps_ns)  # of a lidar only key scans
+    n = int(stays.sum())
+    assert at < 0.6 * len(steps) and update.frames == n + 1
     start = first.truth[0]
-    truth = np.array([between(start, pose) for pose in (*first.truth, *second.truth[at + 1 :])])
-    assert np.hypot(*(update.pose_xyyaw - truth[len(first.truth)])[:2]) < most_claim_m
-    trajectory = core.trajectory()
-    assert trajectory is not None and (np.diff(trajectory.stamps_ns) > 0).all()
-    n = len(first.truth)
+    truth = np.array([between(start, pose) for pose in (*first.truth[stays], *second.truth[at + 1 :])])
+    assert np.hypot(*(update.pose_xyyaw - truth[n])[:2]) < most_claim_m
     assert max(rmse(trajectory.poses_xyyaw[:n], truth[:n]), rmse(trajectory.poses_xyyaw[n:], truth[n:])) < most_m
     across = (trajectory.loops[:, 0] < n) & (trajectory.loops[:, 1] >= n) & (trajectory.loop_weights > 0.5)
     assert across.sum() >= 2
@@ -213,6 +214,28 @@ def test_the_frames_before_the_join_stay_where_they_were() -> None:
     assert after is not None
     assert np.abs(after.poses_xyyaw[:102] - before.poses_xyyaw)[:, :2].max() < 0.01
     assert after.poses_xyyaw[-1] == pytest.approx(before.poses_xyyaw[100], abs=0.01)
+
+
+def test_of_a_lidars_drives_before_the_join_key_scans_stay_where_they_were() -> None:
+    """So a robot that is found again each day keeps what the place needs, and not each frame of the year."""
+    first, second, _ = house_drives()
+    core = new("scan")
+    for step in first.steps:
+        core.update(step)
+    before, nodes = core.trajectory(), len(core.planar_graph().ids)
+    step = next(step for step in second.again() if step.key is not None)
+    core.join(step, between(first.truth[0], second.truth[0]), np.eye(3))
+    after = core.trajectory()
+    assert before is not None and after is not None
+    assert nodes + 1 <= len(after.stamps_ns) <= nodes + 2 < len(before.stamps_ns)
+    at = np.searchsorted(before.stamps_ns, after.stamps_ns[:-1])
+    np.testing.assert_array_equal(before.stamps_ns[at], after.stamps_ns[:-1])
+    np.testing.assert_allclose(after.poses_xyyaw[:-1], before.poses_xyyaw[at], atol=1e-9)
+    np.testing.assert_array_equal(after.odometry_xyyaw[:-1], before.odometry_xyyaw[at])
+    np.testing.assert_array_equal(after.stamps_ns[after.loops], before.stamps_ns[before.loops])
+    variance = np.append(0.0, np.cumsum(before.odometry_std.astype(np.float64) ** 2, axis=0)[:, 0])
+    expected = np.sqrt(np.diff(variance[at]))
+    np.testing.assert_allclose(after.odometry_std[:-1, 0], expected, rtol=1e-4)
 
 
 def test_a_bridge_is_as_uncertain_as_both_ends_and_the_map() -> None:

@@ -93,6 +93,13 @@ class Frames:
         self._joins.set(self.joins[~own[self.joins]])
         self._nodes.set(nodes)
 
+    def keep(self, frames: np.ndarray) -> None:
+        """Let go of the frames that are not among ``frames`` ``(n,)``, ascending; all nodes and the newest one are."""
+        joins = np.unique(np.searchsorted(frames, self.joins))
+        self._nodes.set(np.searchsorted(frames, self.nodes))
+        self._joins.set(joins)
+        self._odometry.set(self.odometry[frames])
+
     def reorder(self, order: np.ndarray, nodes: np.ndarray) -> None:
         """Have the frames ``order`` ``(frames,)`` and the nodes ``nodes`` ``(nodes,)``, both by their old numbers, in
         this order: stretches of which each begins with a node, and with another odometry."""

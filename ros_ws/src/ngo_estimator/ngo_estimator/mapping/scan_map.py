@@ -51,8 +51,9 @@ class ScanMapConfig:
 
 @dataclass(frozen=True)
 class MapUpdate:
-    """What an update did: scans that were ``entered`` and ``moved``, those ``left`` to move for lack of time, and
-    whether a new trajectory began (``restarted``). ``too_large`` says why scans were left out, if any were."""
+    """What an update did: scans that were ``entered``, and ``moved`` or taken out, those ``left`` to move for lack of
+    time, and whether a new trajectory began (``restarted``). ``too_large`` says why scans were left out, if any were.
+    """
 
     entered: int
     moved: int
@@ -69,7 +70,7 @@ class MapUpdate:
 class ScanMap:
     """Owns the grid, the scans in it and the poses at which each was entered.
 
-    Scans wait until a trajectory says where they were taken.
+    Scans wait until a trajectory says where they were taken, and leave with the frames that it lets go.
 
     Args:
         parts: whether parts of a trajectory may leave it and come again, as those of a robot among several: then scans
@@ -177,11 +178,12 @@ class ScanMap:
         """
         deadline = time.monotonic() + budget_s
         restarted = self._begin_anew_for(stamps_ns)
+        gone = 0 if self._parts else self._leave_out_all_but(stamps_ns)
         stamps, scans, poses = self._placed(stamps_ns, poses_xyyaw)
         entered, too_large = len(scans), self._fitting(lambda: self._enter(stamps, scans, poses))
         entered = 0 if too_large else entered
         now = poses_xyyaw[np.searchsorted(stamps_ns, self._stamps)]
-        order, done, moved = self._moved_most_first(now), 0, 0
+        order, done, moved = self._moved_most_first(now), 0, gone
         while done < len(order) and time.monotonic() < deadline:
             rays = np.cumsum([len(self._scans[slot].ends) for slot in order[done : done + _SCANS_AT_ONCE]])
             some = order[done : done + max(1, int(np.searchsorted(rays, _RAYS_AT_ONCE)))]
@@ -244,6 +246,16 @@ class ScanMap:
             }
         self._span = first, last
         return restarted
+
+    def _leave_out_all_but(self, stamps_ns: np.ndarray) -> int:
+        """Drop scans of frames that a trajectory ``(n,)`` let go, or passed over; returns how many leave the map."""
+        gone = self._stamps[~np.isin(self._stamps, stamps_ns)]
+        self.withdraw(gone)
+        run, last = self._map_run, int(stamps_ns[-1])
+        due = np.array([stamp for stamp, (of, _) in self._waiting.items() if of == run and stamp <= last], np.int64)
+        for stamp in due[~np.isin(due, stamps_ns)].tolist():
+            self._waiting.pop(stamp)
+        return len(gone)
 
     def _placed(self, stamps_ns: np.ndarray, poses: Array) -> tuple[np.ndarray, list[RangeScan], Array]:
         """Stamps ``(n,)``, scans and poses ``(n, 3)`` of those that waited, and whose poses are known now."""

@@ -113,6 +113,14 @@ class ScanBackEnd(BackEnd):
         else:
             self.graph.add_node(bounded(self.graph.since_covariance))
 
+    def keep_nodes(self) -> np.ndarray:
+        """Let go of the frames between nodes; returns the old numbers of those that stay ``(n,)``."""
+        frames = self.graph.frames
+        kept = np.union1d(frames.nodes, (len(frames) - 1,))
+        frames.keep(kept)
+        self.closed = replace(self.closed, pairs=np.searchsorted(kept, self.closed.pairs))
+        return kept
+
     def may_join(self, step: RelativeStep) -> bool:
         """Whether another odometry may go on from this step's frame, which needs a key scan."""
         return step.key is not None

@@ -48,6 +48,18 @@ class ScanTrajectory(CorrectedTrajectory):
         """The stamps and the odometry of all frames."""
         return self._log
 
+    def join(self, step: RelativeStep, pose_xyyaw: np.ndarray, covariance: np.ndarray) -> TrajectoryUpdate:
+        """See ``CorrectedTrajectory.join``. The frames before that are no key scans leave: one drive after the other
+        in one place would add frames for ever.
+        """
+        if self.may_join(self._back_end.checked(step)):
+            self.check_later(step)
+            self._work()
+            kept = self._back_end.keep_nodes()
+            self._log.keep(kept)
+            self._online.set(self._online.values[kept])
+        return super().join(step, pose_xyyaw, covariance)
+
     def begin_segment(self, step: RelativeStep) -> TrajectoryUpdate:
         """Go on with another odometry, from the frame that ``step`` ends at; nobody knows where that is in the map.
 

@@ -137,6 +137,14 @@ class StepLog:
         unknown = np.full((1, 3), LARGEST_ODOMETRY, np.float32)
         self.odometry_std.set(np.concatenate((unknown, self.odometry_std.values))[order][1:])
 
+    def keep(self, frames: np.ndarray) -> None:
+        """Let go of the frames that are not among ``frames`` ``(n,)``, ascending; the first and the newest are."""
+        variance = self.odometry_std.values.astype(np.float64) ** 2
+        std = np.sqrt(np.add.reduceat(variance, frames[:-1]))
+        self.stamps_ns.set(self.stamps_ns.values[frames])
+        self.odometry.set(self.odometry.values[frames])
+        self.odometry_std.set(np.minimum(std, LARGEST_ODOMETRY).astype(np.float32))
+
     def check_later(self, step: RelativeStep) -> None:
         """Raise ``LateStep`` if a step of another odometry is not newer than the last one."""
         last = int(self.stamps_ns.values[-1])
