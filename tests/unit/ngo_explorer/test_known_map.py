@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 from scipy.ndimage import distance_transform_edt
 
-from ngo_explorer.known_map import KnownMap
+from ngo_explorer.known_map import FREE, OCCUPIED, KnownMap
 
 RADIUS_M, COMFORT_M = 0.22, 0.6
 
@@ -80,3 +80,16 @@ def test_another_resolution_is_refused() -> None:
     found.update(np.zeros((9, 9), np.int8), 0.1, np.zeros(2))
     with pytest.raises(ValueError, match="resolution"):
         found.update(np.zeros((9, 9), np.int8), 0.05, np.zeros(2))
+
+
+def test_a_mark_stays_through_updates_until_it_is_forgotten() -> None:
+    known, values = KnownMap(0.2, 0.6), np.zeros((40, 40), np.int8)
+    values[0] = 100
+    known.update(values, 0.1, np.zeros(2))
+    known.mark(np.array(((2.05, 2.05), (2.05, 0.25), (9.0, 9.0))))
+    assert known.state[20, 20] == OCCUPIED and known.clearance_m[20, 22] == pytest.approx(0.2)
+    assert known.state[2, 20] == FREE, "the wall beside it is the same"
+    known.update(np.pad(values, ((0, 3), (2, 0))), 0.1, np.array((-0.2, 0.0)))
+    assert known.state[known.cell(np.array((2.05, 2.05)))] == OCCUPIED
+    assert known.forget_marks() and not known.forget_marks()
+    assert known.state[known.cell(np.array((2.05, 2.05)))] == FREE

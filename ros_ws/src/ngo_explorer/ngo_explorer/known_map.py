@@ -71,12 +71,20 @@ class KnownMap:
         new = points_xy[self.clearance_m[rows, columns] > _NEAR_CELLS * self.resolution_m]
         if len(new):
             self._marked = np.vstack((self._marked, new))
-            self._take(np.where(self.state == OCCUPIED, 100, self.state).astype(np.int8))
+            self._take(self._values())
 
     def forget_marks(self) -> bool:
-        """Forget what was marked; the next update lets the map have its say. Returns whether there was anything."""
-        found, self._marked = len(self._marked) > 0, np.zeros((0, 2))
-        return found
+        """Take what was marked for free, until the next update says more. Returns whether there was anything."""
+        if not len(self._marked):
+            return False
+        values = self._values()
+        values[tuple(self._cells(self._marked).T)] = FREE
+        self._marked = np.zeros((0, 2))
+        self._take(values)
+        return True
+
+    def _values(self) -> NDArray[np.int8]:
+        return np.where(self.state == OCCUPIED, 100, self.state).astype(np.int8)
 
     def points(self, cells: NDArray[np.int64]) -> Floats:
         """``(n, 2)`` the middles x, y of cells ``(n, 2)`` row, column."""
