@@ -66,8 +66,9 @@ class ExploreConfig:
 class ExploreDemo:
     """Runs the graph until the explorer has ended; everything it leaves behind lies below out."""
 
-    def __init__(self, config: ExploreConfig, out: Path) -> None:
-        self._config, self._out = config, out
+    def __init__(self, config: ExploreConfig, out: Path, domain_id: int | None = None) -> None:
+        """Run in a ROS domain that is free, or in ``domain_id``."""
+        self._config, self._out, self._domain_id = config, out, domain_id
         self._seen = Seen(Building(config.seed, FloorPlanConfig(scale=config.scale, people=0)))
         self._truth: list[np.ndarray] = []
         self._grid: Grid | None = None
@@ -79,7 +80,7 @@ class ExploreDemo:
     def run(self, show: Show) -> dict[str, Any]:
         """Explore, write picture.png and the logs, and return the result."""
         context = Context()
-        with Graph(self._out / "logs") as graph:
+        with Graph(self._out / "logs", self._domain_id) as graph:
             rclpy.init(args=[], context=context, domain_id=graph.domain_id)
             node = rclpy.create_node("explore_demo", context=context)
             executor = SingleThreadedExecutor(context=context)

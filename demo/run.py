@@ -53,8 +53,8 @@ def parse_arguments(argv: list[str] | None = None) -> argparse.Namespace:
     for name, low in (("seed", 0), ("frames", 3), ("mazes", 1), ("rate", 0)):
         if not getattr(arguments, name) >= low:
             parser.error(f"argument --{name}: {getattr(arguments, name)} is not allowed; at least {low}")
-    if arguments.world == "explore" and (arguments.view or arguments.mazes > 1 or arguments.latency):
-        parser.error("argument --world: explore takes neither --view, --mazes nor --latency")
+    if arguments.world == "explore" and (arguments.mazes > 1 or arguments.latency):
+        parser.error("argument --world: explore takes neither --mazes nor --latency")
     if arguments.view and arguments.mazes > 1:
         parser.error(f"argument --view: it shows one maze; --mazes is {arguments.mazes}")
     return arguments
@@ -82,7 +82,7 @@ def run_one(
         return Session(config, out, view.domain_id if view else None).run(show, with_latency=arguments.latency)
 
 
-def show_exploration(arguments: argparse.Namespace, out: Path, console: Console) -> None:
+def show_exploration(arguments: argparse.Namespace, out: Path, console: Console, view: DemoView | None) -> None:
     """Let the robot map a building, and print what came of it."""
     from demo.explore import ExploreConfig, ExploreDemo  # what the other worlds do without
 
@@ -95,7 +95,7 @@ def show_exploration(arguments: argparse.Namespace, out: Path, console: Console)
     config = ExploreConfig(arguments.seed, rate=arguments.rate or 10.0)
     with Progress(*columns, console=console) as progress:
         task = progress.add_task("explore", total=1.0)
-        result = ExploreDemo(config, out).run(
+        result = ExploreDemo(config, out, view.domain_id if view else None).run(
             lambda state, seen: progress.update(task, description=f"seed {config.seed}: {state}", completed=seen)
         )
     console.print(f"picture and logs: {out}", soft_wrap=True)
@@ -103,18 +103,26 @@ def show_exploration(arguments: argparse.Namespace, out: Path, console: Console)
 
 
 def show_one(arguments: argparse.Namespace, out: Path, console: Console) -> None:
-    """Drive through one maze, with a live view on request, and print its result."""
+    """Run once, with a live view on request, and print the result."""
     with DemoView(out / "logs") if arguments.view else nullcontext() as view:
         if view is not None:
             console.print(f"live view: {view.url}", soft_wrap=True)
-        result = run_one(arguments, arguments.seed, out, console, view)
-        console.print(result_table(result))
-        if "latency_ms" in result:
-            console.print(latency_table(result["latency_ms"]))
-        console.print(f"picture, recording and logs: {out}", soft_wrap=True)
-        print_json(result, out / "result.json")
+        if arguments.world == "explore":
+            show_exploration(arguments, out, console, view)
+        else:
+            show_drive(arguments, out, console, view)
         if view is not None:
             view.stay()
+
+
+def show_drive(arguments: argparse.Namespace, out: Path, console: Console, view: DemoView | None) -> None:
+    """Drive through one maze, and print what came of it."""
+    result = run_one(arguments, arguments.seed, out, console, view)
+    console.print(result_table(result))
+    if "latency_ms" in result:
+        console.print(latency_table(result["latency_ms"]))
+    console.print(f"picture, recording and logs: {out}", soft_wrap=True)
+    print_json(result, out / "result.json")
 
 
 def main(argv: list[str] | None = None) -> int:
@@ -123,9 +131,7 @@ def main(argv: list[str] | None = None) -> int:
     console = Console(stderr=False)
     out = arguments.out or OUT / f"{arguments.world}_{arguments.seed}"
     try:
-        if arguments.world == "explore":
-            show_exploration(arguments, out, console)
-        elif arguments.mazes == 1:
+        if arguments.mazes == 1:
             show_one(arguments, out, console)
         else:
             seeds = range(arguments.seed, arguments.seed + arguments.mazes)
