@@ -9,9 +9,10 @@ The robot explores in this process, with the same map, follower and limits in al
 knows its true poses. In good_wheels, slipping_wheels and no_wheels it is in buildings, and its poses and its map are
 those of the lidar's estimators. FOLDER holds maps of a map server as NAME.yaml. What is measured is kept in ``runs/``.
 The command writes ``training/results/explore.json``, ``docs/results_explore.md`` and
-``docs/images/results_explore_*.png``.
+``docs/images/results_explore_*.png``. Kinds of places that it does not measure stay there as they were.
 """
 
+import json
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -138,10 +139,12 @@ def main(arguments: Arguments) -> dict[str, Any]:
     record = records.record("results", arguments)
     names = [name for name in ROWS if name in (*arguments.rows, BASE)]
     found: dict[str, Table] = {kind: _table(kind, names, arguments) for kind in arguments.worlds}
-    result = {
-        "command": _command(arguments),
-        "revision": record["revision"],
-        "settings": {name: getattr(arguments, name) for name in ("split", "scale", "most_s")},
+    settings = {name: getattr(arguments, name) for name in ("split", "scale", "most_s")}
+    measured = {"command": _command(arguments), "revision": record["revision"], "settings": settings}
+    images = draw_figures(arguments.images, found)
+    result: dict[str, dict[str, Any]] = {
+        "measured": dict.fromkeys(found, measured),
+        "images": {kind: {name: text for name, text in images.items() if f"_{kind}_" in name} for kind in found},
         "places": {kind: len(table) for kind, table in found.items()},
         "poses": {kind: "own" if kind in WHEELS else "true" for kind in found},
         "tables": {
@@ -152,8 +155,10 @@ def main(arguments: Arguments) -> dict[str, Any]:
             for kind, table in found.items()
         },
     }
-    images = draw_figures(arguments.images, found)
-    return arguments.publish("explore", result, explore_page.page(result, images))
+    path = arguments.out / "explore.json"
+    before = json.loads(path.read_text()) if path.exists() else {}
+    result = {part: {**before.get(part, {}), **kinds} for part, kinds in result.items()}
+    return arguments.publish("explore", result, explore_page.page(result))
 
 
 def _command(arguments: Arguments) -> str:

@@ -30,6 +30,24 @@ def test_the_tables_of_two_mazes(tmp_path: Path) -> None:
     assert (tmp_path / "images" / "results_explore_mazes_coverage.png").stat().st_size > 0
 
 
+def test_kinds_that_a_command_does_not_measure_stay(tmp_path: Path) -> None:
+    kept = {
+        "measured": {
+            "command": "make results ARGS=before",
+            "revision": "abc",
+            "settings": {"split": "test", "scale": 0.5},
+        }
+    }
+    kept |= {"images": {}, "places": 3, "poses": "true", "tables": {}, "paired": {}}
+    (tmp_path / "explore.json").write_text(json.dumps({part: {"plans": value} for part, value in kept.items()}))
+    folders = {"out": tmp_path, "docs": tmp_path, "runs": tmp_path / "runs"}
+    main(Arguments(worlds=("mazes",), split="validation", count=2, rows=("ours",), most_s=2.0, **folders))
+    result = json.loads((tmp_path / "explore.json").read_text())
+    assert sorted(result["tables"]) == ["mazes", "plans"] and result["places"]["plans"] == 3
+    page = (tmp_path / "results_explore.md").read_text()
+    assert "make results ARGS=before" in page and "--worlds mazes" in page
+
+
 def test_a_robot_that_estimates_its_poses_has_a_map_and_says_how_wrong_they_are(tmp_path: Path) -> None:
     folders = {"out": tmp_path, "docs": tmp_path, "runs": tmp_path / "runs"}
     chosen = {"worlds": ("slipping_wheels",), "own_rows": (), "split": "validation", "buildings": 2}

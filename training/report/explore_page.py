@@ -13,7 +13,7 @@ _COLUMNS = (
     Column("coverage", "Seen at the end, %", number, 100.0),
     Column("ended_early", "Ended under 98 %, %", number, 100.0),
     Column("iou", "IoU of the map", number),
-    Column("iou_true_poses", "at true poses", number),
+    Column("iou_true_poses", "IoU at true poses", number),
     Column("ate_m", "ATE, m", number),
     Column("within", "Within three deviations, %", number, 100.0),
     Column("collisions", "Collisions a km", number),
@@ -32,9 +32,7 @@ _ROWS = {
 }
 _INTRODUCTION = """# Results: exploration
 
-Written by `{command}`
-at revision {revision}. Seeds of {split}, one run a place and rule; drawn buildings have corridors of {scale:g} of the
-usual length. Robot, map, path follower and limits are the same in all rows; explore_lite's has its own
+One run a place and rule. Robot, map, path follower and limits are the same in all rows; explore_lite's has its own
 smallest frontier, pace and blacklist. Intervals are of 95 %, by resampling places; few places make them too narrow.
 
 Coverage counts the free cells that exact rays see from all places where the robot can go; what a robot has seen is
@@ -59,16 +57,24 @@ _POSES = {
 }
 
 
-def page(result: Mapping[str, Any], images: Mapping[str, str]) -> str:
+_MEASURED = """Written by `{command}`
+at revision {revision}: {places} places, seeds of {split}{scaled}. {poses}"""
+
+
+def page(result: Mapping[str, Any]) -> str:
     """The page of a JSON's content."""
-    parts = [_INTRODUCTION.format(**result, **result["settings"])]
-    for kind, rows in result["tables"].items():
-        shown = {}
+    parts = [_INTRODUCTION]
+    images: dict[str, str] = {}
+    for kind in [kind for kind in _KINDS if kind in result["tables"]]:
+        rows, shown, measured = result["tables"][kind], {}, result["measured"][kind]
+        images |= result["images"][kind]
         for row, numbers in rows.items():
             ratio = result["paired"][kind].get(row, {}).get("path_to_95_ratio")
             shown[_ROWS[row]] = {**numbers, "ratio": ratio} if ratio else numbers
         poses = result["poses"][kind]
         columns = [column for column in _COLUMNS if poses == "own" or column.key not in _OF_OWN_POSES]
-        parts += [f"## {_KINDS[kind]}", f"{result['places'][kind]} places. {_POSES[poses]}"]
-        parts += [table(shown, columns, "Rule")]
+        settings, places = measured["settings"], result["places"][kind]
+        scaled = "" if kind in ("mazes", "plans") else f", corridors of {settings['scale']:g} of the usual length"
+        told = {**measured, **settings, "places": places, "scaled": scaled, "poses": _POSES[poses]}
+        parts += [f"## {_KINDS[kind]}", _MEASURED.format(**told), table(shown, columns, "Rule")]
     return whole([*parts, *figures(images)])
