@@ -52,6 +52,24 @@ def test_probabilities_are_sums_of_log_odds() -> None:
     assert first == round(100.0 / (1.0 + math.exp(3 * 0.5))) == 18
 
 
+def test_what_newer_epochs_saw_through_is_gone_and_a_person_is_not_a_wall() -> None:
+    """Of a wall of 50 scans, 10 newer ones that see through it leave nothing; a single one leaves it."""
+    grid, wall, beyond = OccupancyGrid(1.0), rays((0.0, 2.0)), rays((0.0, 4.0))
+    grid.add([wall] * 50, np.zeros((50, 3)), np.repeat((3, 4), 25))
+    grid.add([beyond], ORIGIN, np.array((5,)))
+    assert drawn(grid.cells(OccupancyConfig()).cropped())[0][2] not in ".?"
+    grid.add([beyond] * 9, np.zeros((9, 3)), np.full(9, 5))
+    found = grid.cells(OccupancyConfig()).trinary(0.25, 0.65).cropped()
+    assert drawn(found) == ["....#"]
+    assert grid.cells(OccupancyConfig(settled=math.inf)).cropped().values[0, 2] == 100
+    # One scan that ends where all others looked through is a person; three in a row are a thing.
+    person = rays((0.0, 1.0))
+    grid.add([person], ORIGIN, np.array((6,)))
+    assert drawn(grid.cells(OccupancyConfig()).trinary(0.25, 0.65).cropped()) == ["....#"]
+    grid.add([person] * 2, np.zeros((2, 3)), np.full(2, 6))
+    assert drawn(grid.cells(OccupancyConfig()).trinary(0.25, 0.65).cropped()) == [".#..#"]
+
+
 def test_a_scan_counts_once_in_a_cell_and_its_ends_win() -> None:
     grid = OccupancyGrid(1.0)
     # The two long rays pass the cell in which the short one ends, and both pass the first.
@@ -87,10 +105,11 @@ def test_what_is_taken_out_leaves_no_trace() -> None:
 
 def test_neither_the_order_nor_the_growth_of_the_grid_changes_the_counts() -> None:
     scans, poses = random_scans(30, 2)
+    epochs = np.arange(30) // 10
     together, one_by_one = OccupancyGrid(0.05), OccupancyGrid(0.05)
-    together.add(scans, poses)
+    together.add(scans, poses, epochs)
     for k in reversed(range(30)):
-        one_by_one.add(scans[k : k + 1], poses[k : k + 1])
+        one_by_one.add(scans[k : k + 1], poses[k : k + 1], epochs[k : k + 1])
     np.testing.assert_array_equal(together.cells(SURE).values, one_by_one.cells(SURE).values)
 
 
@@ -119,9 +138,10 @@ def test_walls_of_a_corridor_fill_a_row_of_cells_each() -> None:
 def test_the_sum_of_grids_is_the_grid_of_all_scans() -> None:
     scans, poses = random_scans(12, 3)
     whole, parts = OccupancyGrid(0.1), [OccupancyGrid(0.1) for _ in range(3)]
-    whole.add(scans, poses)
+    epochs = np.arange(len(scans)) // 7
+    whole.add(scans, poses, epochs)
     for k, part in enumerate(parts[:2]):  # the third has no scan
-        part.add(scans[k::2], poses[k::2])
+        part.add(scans[k::2], poses[k::2], epochs[k::2])
     found, expected = (grid.cells(OccupancyConfig()) for grid in (OccupancyGrid.summed(parts), whole))
     np.testing.assert_array_equal(found.values, expected.values)
     np.testing.assert_array_equal(found.origin_xy, expected.origin_xy)

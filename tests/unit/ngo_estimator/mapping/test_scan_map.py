@@ -110,6 +110,34 @@ def test_a_place_keeps_its_newest_scans() -> None:
         np.testing.assert_array_equal(scan_map.cells().cropped().values, from_scratch(newest, there))
 
 
+@pytest.mark.parametrize(("epoch_s", "drives"), [(600.0, 1), (1e6, 7)])
+def test_a_box_that_was_taken_away_is_gone_after_one_drive(epoch_s: float, drives: int) -> None:
+    """Eight drives saw it from twelve places, and later ones see through it, each in place of another scan.
+
+    Within one epoch it is free once 2.2 hits are less than 0.7 passes by 1.1.
+    """
+    scan_map, poses = ScanMap(ScanMapConfig(epoch_s=epoch_s)), np.zeros((12, 3))
+    poses[:, 0] = 0.6 * np.arange(12)
+    known: list[int] = []
+    for drive in range(8 + drives):
+        assert drive < 9 or not _is_free(scan_map, 10.0)
+        for pose in poses:
+            known.append(10**9 * (1000 * drive + 1) + len(known))
+            step = RelativeStep(known[-1], known[-1] - 1, np.zeros(3), np.eye(3), drive, pose, np.zeros(0), np.zeros(0))
+            ranges = np.array(((10.0 if drive < 8 else 12.0) - pose[0],))
+            scan_map.take(step, [(known[-1], range_scan(np.zeros(1), ranges, np.zeros(3), 20.0))])
+        scan_map.update(np.array(known), np.tile(poses, (drive + 1, 1)))
+    assert len(scan_map) == 8 * len(poses)
+    assert _is_free(scan_map, 10.0)
+
+
+def _is_free(scan_map: ScanMap, x_m: float) -> bool:
+    """Whether the cell at a place on the x axis is free."""
+    found = scan_map.cells()
+    column, row = np.floor((np.array((x_m, 0.0)) - found.origin_xy) / found.resolution_m).astype(int)
+    return bool(found.trinary(0.25, 0.65).values[row, column] == 0)
+
+
 def test_a_scan_waits_for_its_pose() -> None:
     scan_map = ScanMap(EVERY)
     take(scan_map, range(30))

@@ -2,6 +2,9 @@
 
 Log odds of occupancy grids (Moravec and Elfes 1985) are sums over scans. Here the sums are kept as two integers a cell,
 so that a scan which moves is subtracted where it was, to the last bit, and added where it is.
+
+What was seen in the newest epoch in which a cell was seen is counted apart: what older epochs say is bounded, so that
+the newest one can change it, as by the clamping of OctoMap (Hornung et al. 2013).
 """
 
 import math
@@ -20,6 +23,10 @@ UNKNOWN = -1
 _CHUNK = 64  # cells by which the grid grows
 _MOST_CELLS = 40_000_000
 Counts = NDArray[np.int32]
+Epochs = NDArray[np.int64]
+
+_HITS, _PASSES, _EPOCH, _NEW_HITS, _NEW_PASSES, _MARK = range(6)
+"""Of each cell: counts of all scans, the newest epoch in which it was seen, counts of that one, and the last scan."""
 
 
 @dataclass(frozen=True)
@@ -27,17 +34,21 @@ class OccupancyConfig:
     """How counts become probabilities.
 
     A scan that ends in a cell adds ``hit`` to the cell's log odds, one that looks through it subtracts ``passed``. A
-    cell is occupied from the probability ``occupied`` on, and free up to ``free``; the rest is unknown.
+    cell is occupied from the probability ``occupied`` on, and free up to ``free``; the rest is unknown. What older
+    epochs say counts up to the log odds ``settled``.
     """
 
     hit: float = 2.2
     passed: float = 0.7
+    settled: float = 3.5
     occupied: float = 0.65
     free: float = 0.25
 
     def __post_init__(self) -> None:
-        if not (0.0 < self.hit < math.inf and 0.0 < self.passed < math.inf):
-            raise ValueError(f"hit, passed are {self.hit}, {self.passed}; expected positive log odds")
+        if not (0.0 < self.hit < math.inf and 0.0 < self.passed < math.inf and self.settled > 0.0):
+            raise ValueError(
+                f"hit, passed, settled are {self.hit}, {self.passed}, {self.settled}; expected positive log odds"
+            )
         if not 0.0 <= self.free < self.occupied <= 1.0:
             raise ValueError(f"free, occupied are {self.free}, {self.occupied}; expected 0 <= free < occupied <= 1")
 
@@ -98,20 +109,23 @@ class OccupancyGrid:
     def clear(self) -> None:
         """Forget everything."""
         self._low = np.zeros(2, np.int64)  # column and row, counted from the cell round the frame's origin
-        self._hits, self._passes, self._marks = (np.zeros((0, 0), np.int32) for _ in range(3))
+        self._cells = np.zeros((0, 0, 6), np.int32)
         self._mark = 0
 
-    def add(self, scans: Sequence[RangeScan], poses: Array) -> None:
-        """Enter scans at poses ``(scans, 3)`` of their base; raises ``MapTooLarge``."""
-        self._render(scans, poses, 1)
+    def add(self, scans: Sequence[RangeScan], poses: Array, epochs: Epochs | None = None) -> None:
+        """Enter scans of ``epochs`` ``(scans,)``, from 0 on, at poses ``(scans, 3)`` of their base.
 
-    def remove(self, scans: Sequence[RangeScan], poses: Array) -> None:
-        """Take scans out that were entered at exactly these poses ``(scans, 3)``."""
-        self._render(scans, poses, -1)
+        Raises ``MapTooLarge``.
+        """
+        self._render(scans, poses, epochs, 1)
+
+    def remove(self, scans: Sequence[RangeScan], poses: Array, epochs: Epochs | None = None) -> None:
+        """Take scans out that were entered at exactly these poses ``(scans, 3)``, with these ``epochs``."""
+        self._render(scans, poses, epochs, -1)
 
     def cells(self, config: OccupancyConfig) -> OccupancyMap:
         """The probabilities of all cells; the extent grows in large steps, so that it seldom changes."""
-        values = _percent(self._hits, self._passes, config.hit, config.passed)
+        values = _percent(self._cells, config.hit, config.passed, config.settled)
         return OccupancyMap(values, self.resolution_m, (self._low.astype(np.float64) - 0.5) * self.resolution_m)
 
     @classmethod
@@ -121,16 +135,20 @@ class OccupancyGrid:
         if len(sides) != 1:
             raise ValueError(f"the grids have cells of {sorted(sides)} m; expected one side")
         whole = cls(sides.pop())
-        known = [grid for grid in grids if grid._hits.size]
+        known = [grid for grid in grids if grid._cells.size]
         for grid in known:
-            whole._cover(np.stack((grid._low, grid._low + grid._hits.shape[::-1] - 1)).astype(np.float64))
+            whole._cover(np.stack((grid._low, grid._low + grid._cells.shape[1::-1] - 1)).astype(np.float64))
         for grid in known:
-            (column, row), (rows, columns) = (grid._low - whole._low).tolist(), grid._hits.shape
-            for name in ("_hits", "_passes"):
-                getattr(whole, name)[row : row + rows, column : column + columns] += getattr(grid, name)
+            (column, row), (rows, columns, _) = (grid._low - whole._low).tolist(), grid._cells.shape
+            here, its = whole._cells[row : row + rows, column : column + columns], grid._cells
+            newest = np.maximum(here[..., _EPOCH], its[..., _EPOCH])
+            for old, new in ((_HITS, _NEW_HITS), (_PASSES, _NEW_PASSES)):
+                here[..., old] += its[..., old]
+                here[..., new] = sum(np.where(of[..., _EPOCH] == newest, of[..., new], 0) for of in (here, its))
+            here[..., _EPOCH] = newest
         return whole
 
-    def _render(self, scans: Sequence[RangeScan], poses: Array, sign: int) -> None:
+    def _render(self, scans: Sequence[RangeScan], poses: Array, epochs: Epochs | None, sign: int) -> None:
         if not len(scans):
             return
         ends = np.concatenate([scan.ends for scan in scans]).astype(np.float64)
@@ -141,17 +159,17 @@ class OccupancyGrid:
         ends = _in_cells(ends, np.repeat(np.arange(len(scans)), counts), poses, self.resolution_m)
         self._cover(np.concatenate((eyes, ends)))
         if self._mark > np.iinfo(np.int32).max - len(scans):
-            self._marks[:], self._mark = 0, 0
+            self._cells[..., _MARK], self._mark = 0, 0
         starts = np.concatenate((np.zeros(1, np.int64), np.cumsum(counts)))
-        grids = self._hits, self._passes, self._marks
-        _count(*grids, self._low[0], self._low[1], eyes, ends, hits, starts, self._mark, sign)
+        of_scans = np.zeros(len(scans), np.int64) if epochs is None else epochs
+        _count(self._cells, self._low[0], self._low[1], eyes, ends, hits, starts, of_scans, self._mark, sign)
         self._mark += len(scans)
 
     def _cover(self, points: Array) -> None:
         """Let the grid cover points ``(n, 2)`` in cells."""
         low, high = np.floor(points.min(axis=0)), np.floor(points.max(axis=0)) + 1.0
-        if self._hits.size:
-            rows, columns = self._hits.shape
+        if self._cells.size:
+            rows, columns, _ = self._cells.shape
             low, high = np.minimum(low, self._low), np.maximum(high, self._low + (columns, rows))
         low, high = np.floor(low / _CHUNK) * _CHUNK, np.ceil(high / _CHUNK) * _CHUNK
         width, height = high - low
@@ -163,14 +181,13 @@ class OccupancyGrid:
             raise MapTooLarge(
                 f"the map would be {size}; expected at most {_MOST_CELLS} cells: use a coarser resolution", coarser
             )
-        if self._hits.shape == (height, width):
+        before = self._cells
+        if before.shape[:2] == (height, width):
             return
         corner = low.astype(np.int64)
-        column, row = (self._low - corner if self._hits.size else np.zeros(2, np.int64)).tolist()
-        for name in ("_hits", "_passes", "_marks"):
-            before, grown = getattr(self, name), np.zeros((int(height), int(width)), np.int32)
-            grown[row : row + before.shape[0], column : column + before.shape[1]] = before
-            setattr(self, name, grown)
+        column, row = (self._low - corner if before.size else np.zeros(2, np.int64)).tolist()
+        self._cells = np.zeros((int(height), int(width), 6), np.int32)
+        self._cells[row : row + before.shape[0], column : column + before.shape[1]] = before
         self._low = corner
 
 
@@ -185,16 +202,25 @@ def _in_cells(points: Array, scan_of: NDArray[np.int64], poses: Array, resolutio
 
 
 @njit(cache=True)
+def _tell(cell: Counts, of_all: int, of_newest: int, epoch: int, sign: int) -> None:
+    """Count a scan of an epoch in a cell ``(6,)``, among all and among those of the newest epoch."""
+    cell[of_all] += sign
+    if epoch > cell[_EPOCH]:
+        cell[_EPOCH], cell[_NEW_HITS], cell[_NEW_PASSES] = epoch, 0, 0
+    if epoch == cell[_EPOCH]:
+        cell[of_newest] += sign
+
+
+@njit(cache=True)
 def _count(
-    hits: Counts,
-    passes: Counts,
-    marks: Counts,
+    cells: Counts,
     low_column: int,
     low_row: int,
     eyes: Array,
     ends: Array,
     is_hit: NDArray[np.bool_],
     starts: NDArray[np.int64],
+    of_scans: Epochs,
     mark: int,
     sign: int,
 ) -> None:
@@ -204,9 +230,9 @@ def _count(
         mark += 1
         for ray in range(starts[s], starts[s + 1]):
             column, row = math.floor(ends[ray, 0]) - low_column, math.floor(ends[ray, 1]) - low_row
-            if is_hit[ray] and marks[row, column] != mark:
-                marks[row, column] = mark
-                hits[row, column] += sign
+            if is_hit[ray] and cells[row, column, _MARK] != mark:
+                cells[row, column, _MARK] = mark
+                _tell(cells[row, column], _HITS, _NEW_HITS, of_scans[s], sign)
         for ray in range(starts[s], starts[s + 1]):
             x, y = eyes[s, 0], eyes[s, 1]
             along_x, along_y = ends[ray, 0] - x, ends[ray, 1] - y
@@ -220,9 +246,9 @@ def _count(
             column, row = column - low_column, row - low_row
             # As many sides as lie between both cells: rounding cannot lead past the end.
             while columns + rows > 0:
-                if marks[row, column] != mark:
-                    marks[row, column] = mark
-                    passes[row, column] += sign
+                if cells[row, column, _MARK] != mark:
+                    cells[row, column, _MARK] = mark
+                    _tell(cells[row, column], _PASSES, _NEW_PASSES, of_scans[s], sign)
                 if rows == 0 or (columns > 0 and next_x < next_y):
                     column, columns, next_x = column + step_x, columns - 1, next_x + per_x
                 else:
@@ -230,11 +256,15 @@ def _count(
 
 
 @njit(cache=True)
-def _percent(hits: Counts, passes: Counts, hit: float, passed: float) -> NDArray[np.int8]:
-    values = np.full(hits.shape, UNKNOWN, np.int8)
-    for row in range(hits.shape[0]):
-        for column in range(hits.shape[1]):
-            if hits[row, column] | passes[row, column]:
-                odds = hits[row, column] * hit - passes[row, column] * passed
+def _percent(cells: Counts, hit: float, passed: float, settled: float) -> NDArray[np.int8]:
+    rows, columns, _ = cells.shape
+    values = np.full((rows, columns), UNKNOWN, np.int8)
+    for row in range(rows):
+        for column in range(columns):
+            cell = cells[row, column]
+            if cell[_HITS] | cell[_PASSES]:
+                odds = cell[_NEW_HITS] * hit - cell[_NEW_PASSES] * passed
+                before = (cell[_HITS] - cell[_NEW_HITS]) * hit - (cell[_PASSES] - cell[_NEW_PASSES]) * passed
+                odds += min(max(before, -settled), settled)
                 values[row, column] = round(100.0 / (1.0 + math.exp(-min(max(odds, -10.0), 10.0))))
     return values

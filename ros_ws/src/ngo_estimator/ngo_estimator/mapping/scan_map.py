@@ -26,7 +26,8 @@ class ScanMapConfig:
     A scan is taken if the robot has moved by ``spacing_m`` or turned by ``spacing_deg`` since the last one. Of the
     scans from one square of ``place_m`` and one sector of ``place_deg``, the map keeps the newest ``most_at_a_place``:
     its cost grows with the area, not with the time. A scan is entered anew once the ends of its rays have moved by
-    ``moved_cells`` of a cell. At most ``most_waiting`` scans wait for their poses; then the oldest is given up.
+    ``moved_cells`` of a cell. Scans within ``epoch_s`` count alike; older ones count less where these saw something
+    else. At most ``most_waiting`` scans wait for their poses; then the oldest is given up.
     """
 
     resolution_m: float = 0.05
@@ -37,14 +38,23 @@ class ScanMapConfig:
     place_deg: float = 30.0
     most_at_a_place: int = 8
     moved_cells: float = 0.25
+    epoch_s: float = 600.0
     most_waiting: int = 5000
 
     def __post_init__(self) -> None:
-        lengths = self.resolution_m, self.spacing_m, self.spacing_deg, self.place_m, self.place_deg, self.moved_cells
+        lengths = (
+            self.resolution_m,
+            self.spacing_m,
+            self.spacing_deg,
+            self.place_m,
+            self.place_deg,
+            self.moved_cells,
+            self.epoch_s,
+        )
         numbers = self.most_at_a_place, self.most_waiting
         if not all(0.0 < length < math.inf for length in lengths) or min(numbers) < 1:
             raise ValueError(
-                f"resolution_m, spacing_m, spacing_deg, place_m, place_deg, moved_cells are {lengths} and "
+                f"resolution_m, spacing_m, spacing_deg, place_m, place_deg, moved_cells, epoch_s are {lengths} and "
                 f"most_at_a_place, most_waiting are {numbers}; expected positive numbers"
             )
 
@@ -213,7 +223,7 @@ class ScanMap:
     def redraw(self, resolution_m: float) -> None:
         """Draw all scans anew in cells of another side (m); raises ``MapTooLarge``."""
         self._grid = OccupancyGrid(resolution_m)
-        self._grid.add(self._scans, self._poses)
+        self._grid.add(self._scans, self._poses, self._epochs(self._stamps))
 
     def _moved_most_first(self, now: Array) -> np.ndarray:
         """Slots of the scans that have moved, by their poses now ``(scans, 3)``."""
@@ -268,7 +278,7 @@ class ScanMap:
     def _enter(self, stamps: np.ndarray, scans: list[RangeScan], poses: Array) -> None:
         if not scans:
             return
-        self._grid.add(scans, poses)
+        self._grid.add(scans, poses, self._epochs(stamps))
         self._scans += scans
         self._stamps = np.concatenate((self._stamps, stamps))
         self._poses = np.concatenate((self._poses, poses))
@@ -285,7 +295,8 @@ class ScanMap:
             self._remove(np.isin(self._stamps, superseded))
 
     def _remove(self, gone: np.ndarray) -> None:
-        self._grid.remove([self._scans[slot] for slot in np.flatnonzero(gone)], self._poses[gone])
+        scans = [self._scans[slot] for slot in np.flatnonzero(gone)]
+        self._grid.remove(scans, self._poses[gone], self._epochs(self._stamps[gone]))
         self._scans = [scan for scan, leaves in zip(self._scans, gone, strict=True) if not leaves]
         self._stamps, self._poses, self._reach = self._stamps[~gone], self._poses[~gone], self._reach[~gone]
 
@@ -305,10 +316,15 @@ class ScanMap:
         return bool(gone.any())
 
     def _move(self, slots: np.ndarray, poses: Array) -> None:
-        scans = [self._scans[slot] for slot in slots]
-        self._grid.add(scans, poses)
-        self._grid.remove(scans, self._poses[slots])
+        scans, epochs = [self._scans[slot] for slot in slots], self._epochs(self._stamps[slots])
+        self._grid.add(scans, poses, epochs)
+        self._grid.remove(scans, self._poses[slots], epochs)
         self._poses[slots] = poses
+
+    def _epochs(self, stamps_ns: np.ndarray) -> np.ndarray:
+        """The epochs of scans with these stamps ``(n,)``."""
+        epochs: np.ndarray = stamps_ns // round(1e9 * self.config.epoch_s)
+        return epochs
 
 
 def together(maps: Sequence[ScanMap]) -> OccupancyMap:
