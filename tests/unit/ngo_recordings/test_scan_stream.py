@@ -69,6 +69,12 @@ def test_odometry_with_velocities_alone_is_summed_up(tmp_path: Path) -> None:
     np.testing.assert_allclose(
         found[-1].pose_xyyaw, [radius * math.sin(turned), radius * (1.0 - math.cos(turned)), turned], atol=1e-3
     )
+    poses = OdometryPoses()
+    for k in range(60):  # the direction is filled in, as from a compass, and the place is not
+        made = odometry(stamp(k), 0.0, 0.0, 0.02 * k)
+        made.twist.twist = m.twist(0.5, 0.0, 0.2)
+        summed = poses.read(made)
+    np.testing.assert_allclose(summed, found[-1].pose_xyyaw, atol=1e-3)
     standing = odometry(stamp(1), 1.0, 2.0, 0.5)
     poses = OdometryPoses()
     for _ in range(20):
@@ -162,6 +168,7 @@ def geometry(low: float, high: float, increment: float, rays: int) -> Any:
         (-90, 0.0, 1e-9, 181, 0.5, None, "its ends count"),
         (-180, 180, 0.25, 1441, 0.25, None, None),
         (-90, math.nan, 1.0, 181, 1.0, None, "angle_max"),
+        (-180, -181, 1.0, 360, 1.0, None, "angle_max"),
     ],
 )
 def test_angles_follow_the_rule(
@@ -192,12 +199,14 @@ def test_an_empty_scan_and_one_of_more_than_a_turn_do_not_end_a_recording(tmp_pa
     whole = [scan(stamp(k), rays=360, increment=increment) for k in range(4)]
     whole[0].ranges = np.zeros(0, np.float32)
     whole[2] = scan(stamp(2), rays=400, increment=increment)
+    whole[3].range_min, whole[3].range_max = 12.0, 0.1  # leaves no range: neither is believed
     entries = [("/scan", stamp(k), each) for k, each in enumerate(whole)]
     with open_recording([m.write_mcap(tmp_path / "a.mcap", entries)]) as recording:
         topics = choose_topics(recording)
         skipped: Counter[str] = Counter()
         found = [each for each in scan_stream(recording, topics, skipped=skipped) if isinstance(each, LidarScan)]
         assert [len(each.ranges) for each in found] == [360, 360, 360] and skipped == {BAD_SCAN: 1}
+        assert [each.range_max for each in found] == [10.0, 10.0, 0.0]
         described = describe_lidar(recording, topics)
     assert described.rays == 360 and "1 of the first 200 scans of /scan are damaged" in described.notes[0]
 
@@ -289,6 +298,22 @@ def test_each_robot_of_a_recording_has_its_own_wheels_and_mounting(
         assert found.base_from_scan_xyyaw[0] == pytest.approx(0.1 if robot == "robot1" else 1.1)
         by_tf = RecordingTopics(topics.image, wheels=WheelSource(tf=(f"{found.base_frame[:-9]}odom", found.base_frame)))
         assert len([each for each in scan_stream(recording, by_tf) if isinstance(each, WheelPose)]) == 5
+
+
+@pytest.mark.parametrize(("scans", "wheels"), [("/lidar/front", "/diff_drive/odom"), ("/scan_1", "/odom_1")])
+def test_wheels_are_those_that_carry_the_scanner(tmp_path: Path, scans: str, wheels: str) -> None:
+    """Topics and frames may have any names: transforms say what belongs together."""
+    entries: list[m.Entry] = [("/tf_static", stamp(0), m.transforms(static("body_1", "eye_1", 0.1, 0, 0)))]
+    for k in range(5):
+        entries.append((scans, stamp(k), scan(stamp(k), "eye_1")))
+        for name, child in ((wheels, "body_1"), ("/odom_2", "body_2")):
+            made = odometry(stamp(k), 0.1 * k, 0, 0, "odom_1")
+            made.child_frame_id = child
+            entries.append((name, stamp(k), made))
+    with open_recording([m.write_mcap(tmp_path / "a.mcap", entries)]) as recording:
+        topics = choose_topics(recording, TopicArguments(image=scans))
+        found = find_mounting(recording, topics)
+    assert topics.wheels == WheelSource(wheels) and found is not None and found.base_frame == "body_1"
 
 
 def test_a_direction_that_is_given_leaves_the_scanner_its_place(tmp_path: Path) -> None:

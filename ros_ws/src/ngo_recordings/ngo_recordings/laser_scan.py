@@ -89,7 +89,8 @@ class ScanAngles:
 def scan_angles(message: Any, topic: str = "the scan") -> ScanAngles:
     """The angles of a LaserScan, by this rule.
 
-    The message's increment counts while ``angle_min + (n - 1) * increment`` is within 1.5 rays of angle_max. Otherwise,
+    The message's increment counts while ``angle_min + (n - 1) * increment`` is within 1.5 rays of angle_max, or of the
+    same direction a turn further on. Otherwise,
     and where it is 0 or no number, ``(angle_max - angle_min) / (n - 1)`` counts, if that is an increment. An increment
     that spreads n rays over a field of view as if they were n - 1 (180 rays over 180 deg: 1.0056 deg instead of 1 deg)
     contradicts nothing; it counts and is noted. Of a scan of up to two turns the first turn counts.
@@ -116,7 +117,8 @@ def scan_angles(message: Any, topic: str = "the scan") -> ScanAngles:
         return ScanAngles(low, implied, note)
     apart = abs(low + (count - 1) * increment - high)
     given_deg, implied_deg = math.degrees(increment), math.degrees(implied)
-    if count > 1 and apart > _SLACK_RAYS * abs(increment) and is_increment(implied, count):
+    wraps = abs(apart - _FULL_TURN) <= _SLACK_RAYS * abs(increment) and abs(implied) < 0.5 * abs(increment)
+    if count > 1 and apart > _SLACK_RAYS * abs(increment) and is_increment(implied, count) and not wraps:
         note = f"the increment of {topic} is {given_deg:.4f} deg and contradicts its ends: {implied_deg:.4f} deg counts"
         return ScanAngles(low, implied, note)
     if not math.isfinite(high) or (count > 1 and apart > 0.5 * abs(increment)):
@@ -140,13 +142,16 @@ def scan_of(value: Any, topic: str, angle_increment: float | None = None) -> Lid
     """
     angles = scan_angles(value, topic)
     time_increment = float(value.time_increment)
+    low, high = float(value.range_min), float(value.range_max)
+    if low >= high > 0.0:  # between them is no range: neither is known
+        low = high = 0.0
     return LidarScan(
         header_stamp_ns(value),
         angles.angle_min,
         angles.angle_increment if angle_increment is None else angle_increment,
         np.asarray(value.ranges, np.float32)[: angles.rays],
-        float(value.range_min),
-        float(value.range_max),
+        low,
+        high,
         time_increment if math.isfinite(time_increment) else 0.0,
         str(value.header.frame_id).strip("/"),
         topic=topic,

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
-from itertools import islice
 
 import numpy as np
 
@@ -71,7 +70,9 @@ def _first_scans(recording: Recording, topic: str) -> tuple[LidarScan, ScanAngle
     """The first usable scan, its angles, the stamps of the first ones, and how many beside them are damaged."""
     first, angles, damaged, last_error = None, None, 0, RecordingError(f"topic {topic} has no message")
     read, stamps = scan_reader(recording, topic), []
-    for message in islice(recording.messages([topic]), _LOOK):
+    for count, message in enumerate(recording.messages([topic])):
+        if count >= _LOOK and first is not None:
+            break
         try:
             scan = read(message.value)
         except RecordingError as error:
@@ -122,7 +123,8 @@ def describe_lidar(recording: Recording, topics: RecordingTopics) -> LidarDescri
     steps = np.diff(stamps)
     notes = [*recording.notes, *([] if angles.note is None else [angles.note])]
     if damaged:
-        notes.append(f"{damaged} of the first {_LOOK} scans of {topics.image} are damaged and left out")
+        looked = max(_LOOK, damaged + len(stamps))
+        notes.append(f"{damaged} of the first {looked} scans of {topics.image} are damaged and left out")
     notes += _others(recording, topics)
     if recording.stamps_made:
         kind = "made from the order of messages"

@@ -9,11 +9,8 @@ import numpy as np
 
 from ngo_recordings.association import header_stamp_ns
 
-_FEWEST = 5
-"""Messages that move by their velocity and not by their pose, after which the velocity counts."""
-
-_MOVES = 1e-3
-"""Velocity (m/s, rad/s) of a robot that does not stand."""
+_MOVES = (0.05, 0.05)
+"""Way and turn (m, rad) by the velocity, after which the velocity counts if the pose has not moved."""
 
 _LONGEST_S = 1.0
 """Between two messages whose velocities are summed up."""
@@ -26,8 +23,8 @@ class OdometryPoses:
         self.from_velocity = False
         """Whether velocities are summed up."""
         self._first: np.ndarray | None = None
-        self._moved = False  # whether a pose was another than the first one
-        self._count = 0
+        # Whether the place and the direction were others than the first ones: as given, and by velocities.
+        self._moved, self._drove = np.zeros(2, np.bool_), np.zeros(2, np.bool_)
         self._pose = np.zeros(3)
         self._last: tuple[int, np.ndarray] | None = None
 
@@ -42,17 +39,16 @@ class OdometryPoses:
         given = planar_pose(message.pose.pose.position, message.pose.pose.orientation)
         if np.isfinite(twist).all():
             self._sum_up(stamp_ns, twist)
-            self._judge(given, bool((np.abs(twist) > _MOVES).any()))
+            self._judge(given)
         return self._pose.copy() if self.from_velocity else given
 
-    def _judge(self, given: np.ndarray | None, moves: bool) -> None:
+    def _judge(self, given: np.ndarray | None) -> None:
         if self._first is None:
             self._first = given
-        elif given is not None and not np.array_equal(given, self._first):
-            self._moved, self.from_velocity = True, False
-        if moves and not self._moved:
-            self._count += 1
-            self.from_velocity = self._count >= _FEWEST
+        elif given is not None:
+            self._moved |= (bool((given[:2] != self._first[:2]).any()), given[2] != self._first[2])
+        self._drove |= (math.hypot(self._pose[0], self._pose[1]) > _MOVES[0], abs(self._pose[2]) > _MOVES[1])
+        self.from_velocity = bool((self._drove & ~self._moved).any())
 
     def _sum_up(self, stamp_ns: int, twist: np.ndarray) -> None:
         if self._last is not None:

@@ -206,22 +206,35 @@ def choose_scan(recording: Recording) -> str | None:
 def wheel_candidates(recording: Recording, image: str, truth: GroundTruth | None = None) -> list[str]:
     """The topics of odometry that may be the wheels of the robot whose scans are on `image`, the best one first.
 
-    Not those of the truth, of a global frame (map, world) or of another robot's namespace. What is called wheels comes
-    before odom, and this before others, which may be computed of it.
+    Not those of the truth or of a global frame (map, world). Those whose frame carries the scanner, by the transforms,
+    are the robot's; where no transform says it, another robot's namespace does. What is called wheels comes before
+    odom, and this before others, which may be computed of it.
     """
     frame = _scan_frame(recording, image)
     prefix = frame.rpartition("/")[0]
+    tree, _ = _first_transforms(recording, image)
     found = []
     for name in _filled(recording, (ODOMETRY_TYPE,)):
-        if _TRUTH_NAMES.search(name) or (truth is not None and name == truth.topic) or not _related(name, image):
+        if _TRUTH_NAMES.search(name) or (truth is not None and name == truth.topic):
             continue
         parent, child = _odometry_frames(recording, name)
         if any(is_named(parent, each, frame) for each in _GLOBAL_FRAMES):
             continue
         kind = next((k for k, names in enumerate(_WHEEL_NAMES) if names.search(name)), len(_WHEEL_NAMES))
         other = child.rpartition("/")[0] != prefix
-        found.append((-_shared(name, image), other, kind, -recording.topics[name].count, name))
-    return [name for *_, name in sorted(found)]
+        key = (-_shared(name, image), other, kind, -recording.topics[name].count, name)
+        found.append((_carries(tree, child, frame), _related(name, image), key))
+    for wanted in ((True, True), (True, False), (False, True)):
+        if chosen := [key for *told, key in found if tuple(told) == wanted]:
+            return [name for *_, name in sorted(chosen)]
+    return []
+
+
+def _carries(tree: TransformBuffer, base: str, scan_frame: str) -> bool:
+    """Whether transforms of the robot itself join its frame and the scanner's."""
+    chain = tree.between(base, scan_frame)
+    outside = (_ODOMETRY_FRAME, *_GLOBAL_FRAMES)
+    return bool(base and chain) and not any(is_named(part, name, scan_frame) for part in chain for name in outside)
 
 
 def transform_topics(recording: Recording, image: str) -> list[str]:
@@ -328,13 +341,13 @@ def _odometry_frames(recording: Recording, name: str) -> tuple[str, str]:
     return parent.strip("/"), str(getattr(first, "child_frame_id", "")).strip("/")
 
 
-def _choose_transform(recording: Recording, image: str, truth: GroundTruth | None) -> WheelSource | None:
-    """The transform from odom to the robot in the first seconds: one that carries the scanner comes first."""
-    scan, names, tree = _scan_frame(recording, image), transform_topics(recording, image), TransformBuffer()
+def _first_transforms(recording: Recording, image: str) -> tuple[TransformBuffer, list[tuple[str, str]]]:
+    """What is known of the tree after the first seconds, and parent and child of what moves in it."""
+    names, tree = transform_topics(recording, image), TransformBuffer()
     static = [name for name in names if name.endswith("static")]
     for message in recording.messages(static):
         tree.take(getattr(message.value, "transforms", ()), static=True)
-    found: list[tuple[str, str]] = []
+    moving: list[tuple[str, str]] = []
     start_ns: int | None = None
     for message in recording.messages([name for name in names if name not in static]):
         start_ns = message.log_time_ns if start_ns is None else start_ns
@@ -343,8 +356,16 @@ def _choose_transform(recording: Recording, image: str, truth: GroundTruth | Non
         tree.take(getattr(message.value, "transforms", ()), static=False)
         for each in getattr(message.value, "transforms", ()):
             frames = each.header.frame_id.strip("/"), each.child_frame_id.strip("/")
-            if frames not in found and is_named(frames[0], _ODOMETRY_FRAME, scan):
-                found.append(frames)
+            if frames not in moving:
+                moving.append(frames)
+    return tree, moving
+
+
+def _choose_transform(recording: Recording, image: str, truth: GroundTruth | None) -> WheelSource | None:
+    """The transform from odom to the robot in the first seconds: one that carries the scanner comes first."""
+    scan = _scan_frame(recording, image)
+    tree, moving = _first_transforms(recording, image)
+    found = [frames for frames in moving if is_named(frames[0], _ODOMETRY_FRAME, scan)]
     found = [frames for frames in found if truth is None or truth.tf != frames]
     carrying = [frames for frames in found if frames[1] in tree.above(scan)]
     named = [frames for frames in found if any(is_named(frames[1], base, scan) for base in _BASE_FRAMES)]
