@@ -29,6 +29,9 @@ _LEARNED_SCANS = 600
 _LEARNED_M, _LEARNED_RAD = 6.0, 6.0
 """Way and turn after which faults of scanners and wheels are known."""
 
+_LOST_SHARE = 0.01
+"""Of the first scans: with so many that do not say where they were taken, wheels are doubted."""
+
 
 class LidarRun:
     """Feeds scans and wheel poses through both estimators as the nodes do with messages.
@@ -95,10 +98,24 @@ class LidarRun:
     def learn(self, records: Iterable[LidarScan | WheelPose]) -> WheelTruth:
         """Look at the beginning of a recording for what is to be known of scanners and wheels, before a run.
 
-        Returns what is wrong with the wheels. Live, it is learned on the way.
+        Where scans get lost by the wheels, scans alone are asked. Returns what is wrong with the wheels. Live, it is
+        learned on the way.
         """
-        scans, way_m, turn_rad = 0, 0.0, 0.0
+        read: list[LidarScan | WheelPose] = []
+        lost = self._look_at(records, read)
+        if lost and self._odometry.has_wheels:
+            self._odometry.reset()
+            self._odometry.doubt_wheels()
+            self._look_at(read, [])
+        known = self._odometry.keep_lag()
+        self._odometry.reset()
+        return known
+
+    def _look_at(self, records: Iterable[LidarScan | WheelPose], read: list[LidarScan | WheelPose]) -> bool:
+        """Go over records until enough is known, and keep what was read; returns whether scans got lost."""
+        scans, unsure, way_m, turn_rad = 0, 0, 0.0, 0.0
         for record in records:
+            read.append(record)
             with suppress(ValueError):
                 if isinstance(record, WheelPose):
                     self._odometry.add_wheels(record.stamp_ns, record.pose_xyyaw)
@@ -106,13 +123,12 @@ class LidarRun:
                     scans += 1
                     self._odometry.add_scan(record)
                 for step in self._odometry.ready():
+                    unsure += step.unsure
                     way_m += math.hypot(step.relative_xyyaw[0], step.relative_xyyaw[1])
                     turn_rad += abs(float(step.relative_xyyaw[2]))
             if scans > _LEARNED_SCANS or (way_m > _LEARNED_M and turn_rad > _LEARNED_RAD):
                 break
-        known = self._odometry.keep_lag()
-        self._odometry.reset()
-        return known
+        return unsure > _LOST_SHARE * scans
 
     def run(
         self, records: Iterable[LidarScan | WheelPose], truth: Truth | None = None

@@ -132,3 +132,13 @@ def test_rays_that_see_the_robot_are_left_out() -> None:
     away = np.linalg.norm(whole.walls[:, None] - sensors[None], axis=2).min(axis=1)
     assert (away > 0.2).all(), "what it saw of itself is no wall any more"
     assert not errors(records, true)[1].remarks()
+
+
+def test_scans_whose_stamps_are_stray_do_not_end_a_path() -> None:
+    noise, true = np.random.default_rng(0), poses(40)
+    records = [turn(pose, k, noise) for k, pose in enumerate(true)]
+    records[7] = replace(records[7], stamp_ns=0)
+    records[20] = replace(records[20], stamp_ns=10**18)
+    off, run = errors(records, true)
+    assert len(off) == 38 and off.max() < 0.03
+    assert run.remarks() == ["2 of the scans are stamped far from those before and after: left out"]

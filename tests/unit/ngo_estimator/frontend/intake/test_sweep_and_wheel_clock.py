@@ -12,7 +12,7 @@ from ngo_estimator.frontend.lidar.mixture_lidar import MixtureLidar
 from ngo_estimator.geometry.planar_motion import Array, between, compose
 from ngo_estimator.geometry.scan_points import Mounting
 from ngo_estimator.offline.lidar_run import LidarRun
-from ngo_estimator.offline.recorded import RecordedRun
+from ngo_estimator.offline.recorded import RecordedRun, RecordedStep
 from ngo_estimator.slam.scan_trajectory import ScanTrajectory
 from ngo_recordings.scan_stream import LidarScan, WheelPose
 from tests.unit.ngo_estimator.ray_casting import ROOM, cast
@@ -33,7 +33,7 @@ def drive(count: int) -> Array:
     return np.array(poses)
 
 
-def records(poses: Array, wheel_scale: float = 1.0, ahead_s: float = 0.0, sweeps: bool = False) -> list[Any]:
+def records(poses: Array, wheel_scale: float | Array = 1.0, ahead_s: float = 0.0, sweeps: bool = False) -> list[Any]:
     """Scans, which sweep from one stamp to the next or are taken at once, and wheels between them."""
     noise, made = np.random.default_rng(0), []
     angles = np.linspace(-math.pi, math.pi, RAYS, endpoint=False)
@@ -129,11 +129,32 @@ def test_the_wheels_clock_is_found_at_any_distance(ahead_s: float) -> None:
         assert run.remarks() == []
 
 
-@pytest.mark.parametrize("scale", [0.5, 2.0])
-def test_wheels_of_another_scale_are_scaled(scale: float) -> None:
-    off_m, run = run_over(records(STILL, wheel_scale=scale), STILL)
+@pytest.mark.parametrize(
+    ("way", "turn", "said"),
+    [
+        (0.5, 0.5, ["turns are taken times 2", "ways are taken times 2"]),
+        (1.0, -1.0, ["turns are taken times -"]),
+        (-1.0, 1.0, ["ways are taken times -"]),
+    ],
+)
+def test_wheels_of_another_scale_are_scaled(way: float, turn: float, said: list[str]) -> None:
+    off_m, run = run_over(records(STILL, wheel_scale=np.array((way, way, turn))), STILL)
     assert off_m < 0.03
-    assert f"turns are taken times {1.0 / scale:.1f}"[:-2] in run.remarks()[0]
+    assert all(each in line for each, line in zip(said, run.remarks(), strict=False))
+
+
+def test_odometry_in_millimetres_is_corrected_and_handed_on_as_it_was() -> None:
+    """`map` -> `odom` is made of what the robot says."""
+    made = records(STILL, wheel_scale=np.array((1000.0, 1000.0, 1.0)))
+    run = LidarRun(MixtureLidar(), ScanTrajectory(iterations_per_step=1), Mounting(SENSOR))
+    run.learn(made)
+    steps = [event.local for event in run.run(made) if isinstance(event, RecordedStep)]
+    assert "ways are taken times 0.001" in run.remarks()[0]
+    said = {record.stamp_ns: record.pose_xyyaw for record in made if isinstance(record, WheelPose)}
+    handed_on = [step.robot_odom_xyyaw for step in steps[:-3]]
+    np.testing.assert_allclose(handed_on, [said[step.stamp_ns] for step in steps[:-3]], atol=20.0)
+    off = [between(STILL[0], STILL[k + 1]) - step.odom_xyyaw for k, step in enumerate(steps)]
+    assert np.abs(np.array(off)[:, :2]).max() < 0.05
 
 
 def test_wheels_that_have_nothing_to_do_with_the_scans_are_left_out() -> None:

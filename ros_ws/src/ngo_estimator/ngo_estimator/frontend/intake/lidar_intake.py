@@ -9,6 +9,7 @@ from ngo_estimator.data.relative_step import LARGEST_ODOMETRY
 from ngo_estimator.frontend.intake.mounting_yaw import MountingYaw
 from ngo_estimator.frontend.intake.no_return import NoReturnValues
 from ngo_estimator.frontend.intake.own_returns import OwnReturns
+from ngo_estimator.frontend.intake.stray_stamps import StrayStamps
 from ngo_estimator.frontend.intake.sweep import MeasuredSweep
 from ngo_estimator.frontend.intake.turns import Part, Turns
 from ngo_estimator.frontend.intake.wheel_clock import CorrectedWheels, WheelClock, WheelTruth
@@ -16,7 +17,7 @@ from ngo_estimator.frontend.lidar.lidar_step import LidarStep
 from ngo_estimator.frontend.lidar.mixture_lidar import MixtureLidar
 from ngo_estimator.geometry.planar_motion import Array
 from ngo_estimator.geometry.scan_points import Mounting
-from ngo_recordings.scan_stream import LidarScan
+from ngo_recordings.scan_stream import LidarScan, WheelPose
 
 _NEWS_STEPS = 20
 """Steps after which there may be news."""
@@ -49,6 +50,8 @@ class LidarIntake:
         """Begin anew: the next scan is the new origin of ``odom``. What was learned of the scanners stays."""
         self.front_end.reset()
         self._turns = Turns()
+        self._stray_scans: StrayStamps[LidarScan] = StrayStamps()
+        self._stray_wheels: StrayStamps[WheelPose] = StrayStamps()
         self._mountings: dict[str, Mounting | None] = {}
         for sweep in self._sweeps.values():
             sweep.interrupt()
@@ -87,14 +90,20 @@ class LidarIntake:
 
     def add_wheels(self, stamp_ns: int, pose_xyyaw: Array) -> None:
         """Take the wheels' pose ``(3,)``; raises ``ValueError`` as the front end does."""
-        if pose_xyyaw.shape == (3,) and (np.abs(pose_xyyaw) <= LARGEST_ODOMETRY).all():
-            self._clock.add_wheels(stamp_ns, pose_xyyaw)
-            stamp_ns, pose_xyyaw = self._wheels.add(stamp_ns, pose_xyyaw, self._clock.truth)
-        if not self._clock.truth.useless:
-            self.front_end.add_wheels(stamp_ns, pose_xyyaw)
+        if pose_xyyaw.shape != (3,) or not (np.abs(pose_xyyaw) <= LARGEST_ODOMETRY).all():
+            raise ValueError(f"the wheels' pose is {pose_xyyaw}; expected three numbers up to {LARGEST_ODOMETRY:g}")
+        for wheels in self._stray_wheels.add(WheelPose(stamp_ns, pose_xyyaw)):
+            self._clock.add_wheels(wheels.stamp_ns, wheels.pose_xyyaw)
+            at_ns, pose = self._wheels.add(wheels.stamp_ns, wheels.pose_xyyaw, self._clock.truth)
+            if not self._clock.truth.useless:
+                self.front_end.add_wheels(at_ns, pose)
 
     def add_scan(self, scan: LidarScan) -> None:
         """Take a scan of any scanner; raises ``ValueError`` as the front end does."""
+        for each in self._stray_scans.add(scan):
+            self._take(each)
+
+    def _take(self, scan: LidarScan) -> None:
         scanner = f"{scan.topic} {scan.frame_id}".strip()
         if scanner not in self._mountings:
             self._meet(scanner, scan.frame_id)
@@ -142,11 +151,14 @@ class LidarIntake:
             UnusableImage: a scan has no usable ray. It is gone; call again for the next.
         """
         if at_end:
+            for scan in self._stray_scans.flush():
+                self._take(scan)
             self._hand_on(self._turns.flush())
         for step in self.front_end.ready(at_end):
             self._steps += 1
             self._observe(step)
-            yield step
+            said = self._wheels.said(step.stamp_ns - round(self.front_end.lag_s * 1e9))
+            yield step if said is None else replace(step, robot_odom_xyyaw=said)
 
     def _observe(self, step: LidarStep) -> None:
         for own in self._own.values():
@@ -168,6 +180,10 @@ class LidarIntake:
                 if not self._clock.truth.useless:
                     self.front_end.add_wheels(stamp_ns, pose)
 
+    def doubt_wheels(self) -> None:
+        """Use no wheels until the scans say the same as they do."""
+        self._clock.truth = WheelTruth(useless=True)
+
     def keep_lag(self) -> WheelTruth:
         """Take the age of scans that is known by now for what comes after a reset; returns all of the wheels."""
         self._clock.truth = replace(self._clock.truth, age_s=self.lag_s)
@@ -182,6 +198,9 @@ class LidarIntake:
                 lines.append(f"{name} says {values} m where nothing came back: taken so")
         lines += [f"{name}: {line}" for name, sweep in self._sweeps.items() if (line := sweep.remark())]
         lines += self._clock.truth.remarks()
+        for name, stray in (("scans", self._stray_scans), ("wheels", self._stray_wheels)):
+            if stray.left_out:
+                lines.append(f"{stray.left_out} of the {name} are stamped far from those before and after: left out")
         for name, own in self._own.items():
             if own.rays:
                 lines.append(f"{own.rays} rays of {name} see the robot itself: left out")

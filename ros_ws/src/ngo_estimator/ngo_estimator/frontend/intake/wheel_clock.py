@@ -40,14 +40,18 @@ _SCALES = (0.7, 1.4)
 
 _LEAST_WAY_M = 2.0
 
+_FASTEST = (15.0, 10.0)
+_AT_ONCE = (0.5, 1.0)
+"""No robot goes or turns faster (m/s, rad/s), nor by more at once (m, rad): such a step is none of the robot's."""
+
 
 @dataclass(frozen=True)
 class WheelTruth:
     """What the scans say of the wheels.
 
     offset_s: how far their stamps are ahead of the scans'. turn_scale, way_scale: what their turns and ways must be
-    multiplied by. useless: they say nothing about the robot's motion. age_s: how much older scans are than their
-    stamps, by the wheels' clock, where it was learned before.
+    multiplied by; negative where they count the other way round. useless: they say nothing about the robot's motion.
+    age_s: how much older scans are than their stamps, by the wheels' clock, where it was learned before.
     """
 
     offset_s: float = 0.0
@@ -65,9 +69,9 @@ class WheelTruth:
             side = "ahead of" if self.offset_s > 0.0 else "behind"
             lines.append(f"the wheels' clock is {abs(self.offset_s):.2f} s {side} the scans': corrected")
         if self.turn_scale != 1.0:
-            lines.append(f"the wheels' turns are taken times {self.turn_scale:.2f}, as the scans say")
+            lines.append(f"the wheels' turns are taken times {self.turn_scale:.3g}, as the scans say")
         if self.way_scale != 1.0:
-            lines.append(f"the wheels' ways are taken times {self.way_scale:.2f}, as the scans say")
+            lines.append(f"the wheels' ways are taken times {self.way_scale:.3g}, as the scans say")
         return lines
 
 
@@ -127,13 +131,18 @@ class WheelClock:
         if correlation.max() < _CONTRADICTS and -correlation.min() < _CONTRADICTS and turns.max() > _MUCH_RAD:
             self.truth = replace(self.truth, useless=True)
             return
+        other_way = -correlation.min() > max(_SURE, correlation[best] + _BETTER)
+        if other_way:
+            correlation = -correlation
+            best = int(np.argmax(correlation))
         if correlation[best] < _SURE:
             return
         self._judge_clock(offsets, correlation, best)
         near = np.abs(offsets - self.truth.offset_s) < _NEAR_S + _CELL_S
         if near.any():
             lag = int(lags[near][np.argmax(correlation[near])])
-            self._judge_scale(*_aligned(scans, wheels, lag))
+            self._judge_scale(*_aligned(scans, wheels, lag), -1.0 if other_way else 1.0)
+            self.truth = replace(self.truth, useless=False)
 
     def _judge_clock(self, offsets: Array, correlation: Array, best: int) -> None:
         here = np.abs(offsets - self.truth.offset_s) <= _NEAR_S
@@ -147,15 +156,15 @@ class WheelClock:
             self.truth = replace(self.truth, offset_s=found_s)
         self._offset_s = found_s
 
-    def _judge_scale(self, scans: Array, wheels: Array) -> None:
+    def _judge_scale(self, scans: Array, wheels: Array, turn_sign: float) -> None:
         energy = (scans**2).sum(axis=0), (wheels**2).sum(axis=0)
         product = (scans * wheels).sum(axis=0)
-        turned, gone = np.abs(wheels).sum(axis=0) * _CELL_S
+        turned, gone = np.abs(scans).sum(axis=0) * _CELL_S
         turn_scale, way_scale = self.truth.turn_scale, self.truth.way_scale
-        if turned > 0.5 * _LEAST_TURN_RAD and product[0] > _SURE * math.sqrt(energy[0][0] * energy[1][0]):
-            turn_scale = _far_off(math.sqrt(energy[0][0] / energy[1][0]))
-        if gone > 0.5 * _LEAST_WAY_M and product[1] > _SURE * math.sqrt(energy[0][1] * energy[1][1]):
-            way_scale = _far_off(math.sqrt(energy[0][1] / energy[1][1]))
+        if turned > 0.5 * _LEAST_TURN_RAD and product[0] * turn_sign > _SURE * math.sqrt(energy[0][0] * energy[1][0]):
+            turn_scale = _far_off(turn_sign * math.sqrt(energy[0][0] / energy[1][0]))
+        if gone > 0.5 * _LEAST_WAY_M and abs(product[1]) > _SURE * math.sqrt(energy[0][1] * energy[1][1]):
+            way_scale = _far_off(math.copysign(math.sqrt(energy[0][1] / energy[1][1]), product[1]))
         old = self.truth
         if abs(turn_scale - old.turn_scale) > 0.1 or abs(way_scale - old.way_scale) > 0.1:
             self.truth = replace(old, turn_scale=turn_scale, way_scale=way_scale)
@@ -218,11 +227,15 @@ def _far_off(scale: float) -> float:
 
 
 class CorrectedWheels:
-    """The wheels with what is known of them: their poses by the scans' clock, and by the scans' scale."""
+    """The wheels with what is known of them: their poses by the scans' clock, and by the scans' scale.
+
+    A step that no robot makes, as where a driver begins anew, is none.
+    """
 
     def __init__(self) -> None:
         self._raw: deque[tuple[int, Array]] = deque(maxlen=2000)
         self._poses: deque[tuple[int, Array]] = deque(maxlen=2000)
+        self._changed = False  # whether poses are no longer as the wheels say
 
     def add(self, stamp_ns: int, pose: Array, truth: WheelTruth) -> tuple[int, Array]:
         """Take a pose ``(3,)`` as the wheels say it; returns it as it should be."""
@@ -230,9 +243,17 @@ class CorrectedWheels:
             self._raw.clear()
             self._poses.clear()
         scaled = pose
-        if self._raw and (truth.turn_scale, truth.way_scale) != (1.0, 1.0):
-            step = between(self._raw[-1][1], pose) * (truth.way_scale, truth.way_scale, truth.turn_scale)
-            scaled = compose(self._poses[-1][1], step)
+        if self._raw:
+            turned = math.copysign(truth.way_scale, truth.way_scale * truth.turn_scale)
+            step = between(self._raw[-1][1], pose) * (truth.way_scale, turned, truth.turn_scale)
+            elapsed_s = (stamp_ns - self._raw[-1][0]) * 1e-9
+            step[2] = wrap(float(step[2]))
+            way, turn = math.hypot(step[0], step[1]), abs(step[2])
+            if way > _FASTEST[0] * elapsed_s + _AT_ONCE[0] or turn > _FASTEST[1] * elapsed_s + _AT_ONCE[1]:
+                step, self._changed = np.zeros(3), True
+            self._changed |= (truth.turn_scale, truth.way_scale) != (1.0, 1.0)
+            if self._changed:
+                scaled = compose(self._poses[-1][1], step)
         made = stamp_ns + round((truth.age_s - truth.offset_s) * 1e9), scaled
         if not self._raw or stamp_ns > self._raw[-1][0]:
             self._raw.append((stamp_ns, pose))
@@ -248,19 +269,24 @@ class CorrectedWheels:
 
     def motion(self, from_ns: int, to_ns: int) -> Array | None:
         """The motion ``(3,)`` between two stamps; None where it is not known."""
-        begin, end = self._at(from_ns), self._at(to_ns)
+        begin, end = self._at(self._poses, from_ns), self._at(self._poses, to_ns)
         return None if begin is None or end is None else between(begin, end)
 
-    def _at(self, stamp_ns: int) -> Array | None:
+    def said(self, stamp_ns: int) -> Array | None:
+        """The pose ``(3,)`` as the wheels say it, at a stamp by the scans' clock; None where it is not known, or is
+        that of `add`."""
+        return self._at(self._raw, stamp_ns) if self._changed else None
+
+    def _at(self, poses: deque[tuple[int, Array]], stamp_ns: int) -> Array | None:
         index = len(self._poses) - 1
         while index >= 0 and self._poses[index][0] > stamp_ns:  # the newest are asked for
             index -= 1
         if index < 0 or (index == len(self._poses) - 1 and self._poses[index][0] < stamp_ns):
             return None
-        before_ns, before = self._poses[index]
+        (before_ns, _), before = self._poses[index], poses[index][1]
         if before_ns == stamp_ns:
             return before
-        after_ns, after = self._poses[index + 1]
+        (after_ns, _), after = self._poses[index + 1], poses[index + 1][1]
         off = after - before
         off[2] = wrap(off[2])
         pose: Array = before + (stamp_ns - before_ns) / (after_ns - before_ns) * off
