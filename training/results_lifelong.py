@@ -15,6 +15,7 @@ from functools import partial
 from typing import Any, Literal
 
 from ngo_estimator.frontend.lidar import mixture_lidar
+from ngo_estimator.loops.scan_settings import ScanGraphConfig
 from ngo_estimator.mapping import scan_map
 from ngo_estimator.slam import fleet, scan_trajectory, session
 from training.common import records
@@ -64,6 +65,8 @@ class Arguments(Folders):
     """Scans of each drive."""
     starts: int = 4
     """Starts in each drive at which a robot looks for itself in the map so far."""
+    most_scans: int = ScanGraphConfig.most_scans
+    """Key scans from which on old ones leave the graph in a year; a shorter year shows with fewer whether it holds."""
     split: Literal["validation", "test"] = "test"
     """Seeds of the buildings. Settings are chosen on validation; test is for the final table alone."""
 
@@ -94,7 +97,10 @@ def main(arguments: Arguments) -> dict[str, Any]:
 
 
 _KINDS = {"fleet": ("buildings", "aliased"), "year": ("year",)}
-_SETTINGS = {"fleet": ("buildings", "aliased", "robots", "scans"), "year": ("years", "drives", "year_scans", "starts")}
+_SETTINGS = {
+    "fleet": ("buildings", "aliased", "robots", "scans"),
+    "year": ("years", "drives", "year_scans", "starts", "most_scans"),
+}
 
 
 def _fleet(found: dict[str, Table], tables: dict[str, Any]) -> dict[str, Any]:
@@ -121,12 +127,12 @@ def _years(arguments: Arguments) -> Table:
     weights, folder = arguments.weights / "scan", arguments.runs / "lifelong"
     identity = f"{folder_digest(weights)} {code_digest((*_YEAR_CODE, year_drives))}"
     row = Row(partial(patrol, identity=identity), folder_digest(weights), _YEAR_CODE)
-    of_each = arguments.drives, arguments.year_scans, arguments.starts
+    of_each = arguments.drives, arguments.year_scans, arguments.starts, arguments.most_scans
     plan = [
         (
             Drive(
                 f"year_{seed}",
-                f"building {seed}, {of_each} drives, scans, starts",
+                f"building {seed}, {of_each} drives, scans, starts, most scans",
                 partial(Year, seed, *of_each, weights, folder / f"year_{seed}"),
                 (year_drives,),
             ),

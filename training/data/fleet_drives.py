@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import cache
 
 from ngo_sim.building2d import Building2d, BuildingDrive
 from ngo_sim.floor_plans import FloorPlanConfig
@@ -35,6 +36,7 @@ def fleet_drives(seed: int, robots: int, scans: int, aliased: bool = False) -> t
     )
 
 
+@cache
 def patrol_scanner(seed: int, plan: FloorPlanConfig) -> ScannerConfig:
     """The scanner that is drawn for a building, with 360 rays ten times a second."""
     drawn = Building2d(plan)

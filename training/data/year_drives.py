@@ -50,7 +50,7 @@ def year_drive(seed: int, number: int, scans: int) -> YearDrive:
     Before each drive but the first, one piece of furniture in twenty is moved. Stamps go on through the year. Each
     drive has another start and another way; the robot, its wheels and its scanner with 360 rays stay.
     """
-    plan = FloorPlanConfig(furniture_moves=number)
-    drive = Building2d(plan, patrol_scanner(seed, plan)).record(seed, _FAR_M, scans, drive=number)
+    building = Building2d(FloorPlanConfig(furniture_moves=number), patrol_scanner(seed, FloorPlanConfig()))
+    drive = building.record(seed, _FAR_M, scans, drive=number)
     words = f"building seed {seed}, drive {number} of a year, {scans} scans"
     return YearDrive(lidar_drive(drive, f"year_{seed}_{number}", words), drive)

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -45,12 +46,15 @@ _MAP_IDENTITY = {"map": "scan", "max_range": 0.0}
 @dataclass(frozen=True)
 class Year:
     """A year in the building of ``seed``: so many ``drives`` of ``scans`` each, and ``starts`` in each drive at which a
-    robot looks for itself in the map so far. What is done is kept in ``folder``."""
+    robot looks for itself in the map so far. Old key scans leave the graph from ``most_scans`` on. What is done is kept
+    in ``folder``.
+    """
 
     seed: int
     drives: int
     scans: int
     starts: int
+    most_scans: int
     weights: Path
     folder: Path
 
@@ -59,14 +63,14 @@ def patrol(year: Year, identity: str) -> Measured:
     """All numbers of each drive ``(drives,)``; NaN where a drive has none.
 
     ``ate_m``: error of the drive's poses from where the robot was found on. ``iou``: of the map's free cells with those
-    of the building as it is now, and ``occupied_iou`` of the others. ``ms_a_scan``: computing time of odometry and
-    correction, and ``map_ms_a_scan`` of the map. ``memory_mb``: size of all that a saved state holds. ``nodes``: of the
-    graph. ``load_s``: time to load the state. Of the starts, the ``localised_share`` was found within 50 scans, the
-    ``found_share`` within 300, in the mean after ``scans_to_claim``. ``false_claims``: of all starts, and of the drive
-    itself. ``joined``: whether the map went on with the drive.
+    of the building as it is now, and ``occupied_iou`` of the others; with ``_of_sums`` where all scans count alike.
+    ``ms_a_scan``: computing time of odometry and correction, and ``map_ms_a_scan`` of the map. ``memory_mb``: size of
+    all that a saved state holds. ``nodes``: of the graph. ``load_s``: time to load the state. Of the starts, the
+    ``localised_share`` was found within 50 scans, the ``found_share`` within 300, in the mean after ``scans_to_claim``.
+    ``false_claims``: of all starts, and of the drive itself. ``joined``: whether the map went on with the drive.
     """
     found: list[Measured] = []
-    identity = f"{identity} {year.scans} {year.starts}"
+    identity = f"{identity} {year.scans} {year.starts} {year.most_scans}"
     for number in range(year.drives):
         path = year.folder / f"drive_{number:03d}.npz"
         known = read(path, f"{identity} {number}")
@@ -92,10 +96,16 @@ def year_numbers(years: Sequence[Measured]) -> dict[str, Numbers]:
 
 
 def year_ratios(years: Sequence[Measured]) -> Numbers:
-    """Numbers of the last ten drives as a share of what they are compared with, one of each year."""
+    """Numbers of the last ten drives as a share of what they are compared with, one of each year; none of a year in
+    which both are the same drives."""
     last, found = _ROWS["last_ten"], {}
     for key, row in (("memory_mb", "eleven_to_twenty"), ("ms_a_scan", "eleven_to_twenty"), ("ate_m", "first_ten")):
-        both = [(_of([year], key, last), _of([year], key, _ROWS[row])) for year in years]
+        before = _ROWS[row]
+        both = [
+            (_of([year], key, last), _of([year], key, before))
+            for year in years
+            if len(year.errors[key]) >= 10 + (before.stop or 0)
+        ]
         found[key] = np.array([a.mean() / b.mean() for a, b in both if len(a) and len(b)])
     return intervals(found)
 
@@ -117,7 +127,7 @@ class _Drive:
         self._truth = reference
         self._front = DriveRuns(self._drive.measured, year.weights).front(Pipeline())
         self._map, self._map_s = ScanMap(), 0.0
-        config = read_lidar_file(year.weights, "graph", ScanGraphConfig)
+        config = replace(read_lidar_file(year.weights, "graph", ScanGraphConfig), most_scans=year.most_scans)
         self._session = Session("scan", ScanTrajectory(config), MapOrigin(np.zeros(3)), SmoothedCorrection(0.0))
         self._known = TruePoses(np.zeros(0, np.int64), np.zeros((0, 3)))  # of scans in the map
 
@@ -230,15 +240,16 @@ class _Drive:
 
     def _map_errors(self, numbers: dict[str, float]) -> dict[str, np.ndarray]:
         """Compare the map with what exact scans from the same true poses show of the building as it is now."""
-        found = self._map.cells()
         angles, ranges, sensor = self._drive.exact_scans(self._known.poses_xyyaw)
         most_m = self._drive.building.scanner.range_max_m
         scans = [range_scan(angles, seen.astype(np.float64), sensor, most_m) for seen in ranges]
         grid, config = OccupancyGrid(self._map.resolution_m), self._map.config.occupancy
         grid.add(scans, se2.compose(self._map_from_truth(), self._known.poses_xyyaw))
-        one, other = (each.trinary(config.free, config.occupied) for each in (found, grid.cells(config)))
-        free, occupied = intersections(one, other)
-        numbers |= {"iou": free, "occupied_iou": occupied}
+        one, other = (each.trinary(config.free, config.occupied) for each in (self._map.cells(), grid.cells(config)))
+        numbers["iou"], numbers["occupied_iou"] = intersections(one, other)
+        self._map.config = replace(self._map.config, occupancy=replace(config, settled=math.inf))
+        unsettled = self._map.cells().trinary(config.free, config.occupied)
+        numbers["iou_of_sums"], numbers["occupied_iou_of_sums"] = intersections(unsettled, other)
         return {"found": one.values, "true": other.values, "corners": np.stack((one.origin_xy, other.origin_xy))}
 
     def _folder(self, further: int) -> Path:

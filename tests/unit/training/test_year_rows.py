@@ -28,7 +28,7 @@ def a_year(drives: int) -> Measured:
     empty = {f"{kind}_{when}": np.zeros((2, 2), np.int8) for kind in ("found", "true") for when in _WHEN}
     corners = {f"corners_{when}": np.zeros((2, 2)) for when in _WHEN}
     errors = {"ate_m": np.where(number == 5.0, np.nan, number), "memory_mb": number + 1.0, "ms_a_scan": number + 1.0}
-    return Measured({**errors, "iou": 0.0 * number}, {**empty, **corners})
+    return Measured({**errors, "iou": 0.0 * number, "occupied_iou": 0.0 * number}, {**empty, **corners})
 
 
 _WHEN = ("first", "middle", "last")
@@ -53,7 +53,7 @@ def test_the_table_has_ten_drives_a_row_and_keeps_what_is_not_measured(
 
 def test_a_year_goes_on_from_what_is_on_disk(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(year_rows, "MOST_SCANS", 100)
-    year = Year(12_001, 1, 400, 1, WEIGHTS / "scan", tmp_path)
+    year = Year(12_001, 1, 400, 1, 4000, WEIGHTS / "scan", tmp_path)
     first = patrol(year, "toy")
     longer = patrol(dataclasses.replace(year, drives=2), "toy")
     assert longer.errors["ate_m"][0] == first.errors["ate_m"][0] < 0.1
