@@ -153,7 +153,7 @@ def strongest_modes(hypotheses: Hypotheses, place_m: float) -> tuple[Mode, ...]:
         best = int(np.where(left, total, -1.0).argmax())
         looks = np.unique(hypotheses.look[agree[best]])
         found.append(Mode(at[best], hypotheses.covariance[best], float(total[best]), looks))
-        left &= (distance[best] > _APART * _MOST_PLACES * place_m) | (turn[best] > _APART * _MOST_RAD)
+        left &= _well_apart(distance[best], turn[best], place_m)
     return tuple(found)
 
 
@@ -161,6 +161,11 @@ def agreeing(hypotheses: Hypotheses, pose: np.ndarray, covariance: np.ndarray, p
     """Which hypotheses agree ``(n,)`` with a pose ``(3,)`` of a covariance ``(3, 3)``."""
     distance, turn = _apart(hypotheses.poses, pose)
     return _agree(distance, turn, _variances(hypotheses.covariance) + _variances(covariance), place_m)
+
+
+def elsewhere(poses: np.ndarray, pose: np.ndarray, place_m: float) -> np.ndarray:
+    """Which of the poses ``(n, 3)`` are in another place than a pose ``(3,)``."""
+    return _well_apart(*_apart(poses, pose), place_m)
 
 
 def support(hypotheses: Hypotheses, which: np.ndarray) -> float:
@@ -203,6 +208,11 @@ def _variances(covariance: np.ndarray) -> np.ndarray:
 def _apart(a: np.ndarray, b: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     off = a - b
     return np.hypot(off[..., 0], off[..., 1]), np.abs(_wrapped(off[..., 2]))
+
+
+def _well_apart(distance: np.ndarray, turn: np.ndarray, place_m: float) -> np.ndarray:
+    apart: np.ndarray = (distance > _APART * _MOST_PLACES * place_m) | (turn > _APART * _MOST_RAD)
+    return apart
 
 
 def _agree(distance: np.ndarray, turn: np.ndarray, variance: np.ndarray, place_m: float) -> np.ndarray:

@@ -24,6 +24,7 @@ from ngo_estimator.loops.place_evidence import PlaceEvidence, evidence_of, last_
 from ngo_estimator.loops.scan_loops import EVIDENCE, ScanLoops
 from ngo_estimator.loops.scan_settings import ScanGraphConfig
 from ngo_estimator.loops.scan_submaps import laid_together
+from ngo_estimator.slam.alike_places import alike_share
 from ngo_estimator.slam.evidence import HypothesisWindow, agreeing, fused, strongest_modes
 from ngo_estimator.slam.localisation import LocalisationConfig, may_claim
 from ngo_estimator.slam.scan_matcher import ScanMatcher
@@ -35,8 +36,12 @@ _REACH_M = 2.0
 _GROWN = 1.1
 """The map is laid out anew when so many times as many key scans are to be searched."""
 
-_LEAST_WALLS, _MOST_THROUGH = 8, 0.33
-"""A claim needs so many different walls, and no part of the way may look through more of the walls than this share."""
+_LEAST_WALLS, _MOST_MEAN, _MOST_THROUGH = 8, 0.15, 0.33
+"""A claim needs so many different walls. The way may look through so much of the walls in the mean, and each of its
+parts through so much at most."""
+
+_WAY_KEYS, _MOST_ALIKE = 400, 0.1
+"""Where of a way's last so many key scans more than this share is alike, what looks the same may be another place."""
 
 _TRIAL_LOOKS, _CONTRADICTIONS = 40, 3
 """Looks after a claim in which the newest scans may still contradict it, and how many in a row do."""
@@ -123,7 +128,10 @@ class OwnMap:
         agree = agreeing(hypotheses, modes[0].pose_xyyaw, modes[0].covariance, place_m)
         pose, _ = fused(hypotheses.where(agree), modes[0].pose_xyyaw)
         evidence = self._evidence(pose, scans, views, graph)
-        if evidence.walls < _LEAST_WALLS or evidence.through > _MOST_THROUGH:
+        if not _suffices(evidence):
+            return ScanLoops.none()
+        if self._is_ambiguous(int(self._keys[_nearest(self._poses, pose[None])[0]]), scans, views, graph):
+            self._forget_looks()
             return ScanLoops.none()
         loops = self._loops(agree, self.looks[hypotheses.look], modes[0].support)
         self._forget_looks()
@@ -138,6 +146,15 @@ class OwnMap:
         stretch = last_stretch(graph.poses, int(graph.segments[-1]))
         at = se2.compose(pose, se2.between(graph.poses[-1], graph.poses[stretch]))
         return evidence_of(scans, views, (stretch, at), (self._keys, self._poses), count_walls=True)
+
+    def _is_ambiguous(self, there: int, scans: Sequence[KeyScan], views: KeyScanViews, graph: PoseGraph) -> bool:
+        """Whether places look alike on the robot's own way, or on that of a key scan where it would be found."""
+        ends = np.append(graph.segments, len(graph))
+        for segment in (segment_of(graph.segments, np.array(there)), len(graph.segments) - 1):
+            way = np.arange(max(ends[segment], ends[segment + 1] - _WAY_KEYS), ends[segment + 1])
+            if alike_share(way, scans, views, graph.poses, self._config.loops, _suffices) > _MOST_ALIKE:
+                return True
+        return False
 
     def contradicted(self, scans: Sequence[KeyScan], views: KeyScanViews, graph: PoseGraph, parts: np.ndarray) -> bool:
         """Whether the key scans since the newest segment was joined show that it lies elsewhere.
@@ -263,6 +280,11 @@ class OwnMap:
         """Raise ``StateError`` about restored arrays that do not belong together."""
         require(len(self.looks) == len(self._window), f"{len(self._window)} looks are not of as many key scans")
         require(len(self._keys) == len(self._poses), f"{len(self._keys)} key scans do not have as many poses")
+
+
+def _suffices(evidence: PlaceEvidence) -> bool:
+    """Whether a stretch of the way and a place have enough in common, and contradict each other little."""
+    return evidence.walls >= _LEAST_WALLS and evidence.mean <= _MOST_MEAN and evidence.through <= _MOST_THROUGH
 
 
 def _nearest(poses: np.ndarray, others: np.ndarray) -> np.ndarray:
