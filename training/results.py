@@ -3,6 +3,7 @@
     python -m training.results --world maze2d
     python -m training.results --world maze3d
     python -m training.results --world scan      # of the lidar: training.results_scan
+    python -m training.results --world camera    # of a calibrated camera: training.results_camera
     python -m training.results --world doom      # of other Doom maps: training.results_doom
     python -m training.results --world graphs    # of graphs with wrong loops: training.results_graphs
     python -m training.results --world explore   # of exploration: training.results_explore
@@ -26,7 +27,15 @@ import numpy as np
 from ngo_estimator.loops import overlaps, pair_measurement
 from ngo_estimator.ngo import neural_graph_optimizer
 from ngo_estimator.trajectory import errors
-from training import results_doom, results_explore, results_graphs, results_lifelong, results_scan, results_stress
+from training import (
+    results_camera,
+    results_doom,
+    results_explore,
+    results_graphs,
+    results_lifelong,
+    results_scan,
+    results_stress,
+)
 from training.common import records
 from training.common.command_line import check_at_least, run_command
 from training.data.feature_store import open_store
@@ -63,6 +72,7 @@ class Arguments(Folders):
 
 
 TABLES: dict[str, ModuleType] = {
+    "camera": results_camera,
     "scan": results_scan,
     "doom": results_doom,
     "explore": results_explore,

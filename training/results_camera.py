@@ -1,10 +1,10 @@
 """How good ``world:=camera`` is on Doom maps: odometry and loops from pictures of 640 x 480, without training.
 
-    python -m training.results_camera --split validation
-    python -m training.results_camera
+    python -m training.results --world camera --split validation
+    python -m training.results --world camera
 
 A drive of the explorer on each map. The motion given is that of wheels with errors (``given_motion``). The command
-prints a table and writes ``training/results/camera.json``.
+prints a table and writes ``training/results/camera.json``: each drive, and rows with means over drives.
 """
 
 import json
@@ -29,10 +29,12 @@ from training.common import records
 from training.common.command_line import check_at_least, run_command
 from training.data.doom_drives import TEST_MAPS, VALIDATION_MAPS, Map
 from training.scoring.metrics import absolute_error_m, path_length_m, trajectory_error, within
+from training.scoring.statistics import mean_interval
 
 _MAPS = {"validation": VALIDATION_MAPS, "test": TEST_MAPS}
 _FIRST_SEED = {"validation": 10_000, "test": 20_000}
 _EYE_M = 0.8
+_ROWS = ("given", "odometry", "corrected")
 _WRONG_M, _WRONG_RAD = 0.5, np.radians(5.0)
 """A loop that is off by more is wrong."""
 
@@ -41,6 +43,7 @@ _WRONG_M, _WRONG_RAD = 0.5, np.radians(5.0)
 class Arguments:
     """Settings of the measurement."""
 
+    world: Literal["camera"] = "camera"  # World to measure in.
     split: Literal["validation", "test"] = "test"  # Maps to measure on; settings are chosen on validation.
     seeds: int = 1  # Drives of each map.
     frames: int = 1000  # Frames of a drive.
@@ -160,9 +163,26 @@ def main(arguments: Arguments) -> dict[str, Any]:
             result["drives"][title] = measured(one, given_motion(one.truth, seed + 100 * number))
             print(_line(title, result["drives"][title]), flush=True)
             result["median"] = _medians(list(result["drives"].values()))
+            if len(result["drives"]) > 1:
+                result["tables"] = {"doom": _rows(list(result["drives"].values()))}
             write_whole(arguments.results / name, json.dumps(result, indent=1, default=str) + "\n")
     print(_line(f"median, {len(result['drives'])} drives", result["median"]))
     return result
+
+
+def _rows(drives: list[dict[str, float]]) -> dict[str, dict[str, Any]]:
+    """Means over drives, with intervals of 95 %, of what was given, of the odometry, and of the corrected path."""
+
+    def mean(values: list[float]) -> dict[str, object]:
+        return mean_interval(np.array(values)).as_json()
+
+    names = ("ate_m", "final_percent")
+    rows = {}
+    for row in _ROWS:
+        rows[row] = {name: mean([one[f"{row}_{name}"] for one in drives]) for name in names}
+        rows[row]["ate_share"] = mean([one[f"{row}_ate_m"] / one["given_ate_m"] for one in drives])
+    rows["corrected"] |= {name: mean([one[name] for one in drives]) for name in ("within_3_std", "frames_a_second")}
+    return rows
 
 
 def _medians(drives: list[dict[str, float]]) -> dict[str, float]:

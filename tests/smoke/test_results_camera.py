@@ -13,7 +13,10 @@ pytestmark = pytest.mark.slow
 
 def test_a_short_drive_on_a_map(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(results_camera._MAPS, "test", (("take_cover.wad", "MAP01"),))
-    result = results_camera.main(results_camera.Arguments(frames=24, results=tmp_path))
-    (drive,) = result["drives"].values()
+    result = results_camera.main(results_camera.Arguments(frames=24, seeds=2, results=tmp_path))
+    drive, other = result["drives"].values()
     assert all(np.isfinite(value) for value in drive.values()) and drive["path_m"] > 0.0
+    assert result["tables"]["doom"]["corrected"]["ate_m"]["mean"] == pytest.approx(
+        0.5 * (drive["corrected_ate_m"] + other["corrected_ate_m"])
+    )
     assert json.loads((tmp_path / "camera.json").read_text())["median"] == result["median"]
