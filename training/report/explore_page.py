@@ -39,7 +39,8 @@ Coverage counts the free cells that exact rays see from all places where the rob
 entered at its true poses. The ratio is the geometric
 mean over the places where both rules came to 95 %. The tour on the known map is searched for (insertion, 2-opt, or-opt,
 large neighbourhoods); the shortest one may be a little shorter.
-IoU is the mean of free and occupied cells of the robot's own map beside those exact rays; at true poses it is that of
+IoU is the mean of free and occupied cells of the robot's own map beside those exact rays, a map of
+own poses aligned as for the ATE; at true poses it is that of
 the scans of the same path. Decisions are timed as
 processor time."""
 _KINDS = {

@@ -32,8 +32,8 @@ class Explored:
 
     ``path_m``, ``coverage`` and ``time_s`` ``(n,)``: length of the path, share seen of what can be seen, and time.
     ``poses_xyyaw`` ``(m, 3)`` true. ``ended`` says whether the robot ended it by itself. ``found`` is its own map,
-    ``at_true_poses`` that of the same scans at true poses, and ``errors`` are those of its own poses, by the metric's
-    key.
+    aligned with the truth as a whole, ``at_true_poses`` that of the same scans at true poses, and ``errors`` are those
+    of its own poses, by the metric's key.
     """
 
     path_m: np.ndarray
@@ -70,6 +70,10 @@ class Estimator(Protocol):
 
     def cells(self) -> OccupancyMap:
         """The map so far."""
+        ...
+
+    def aligned_cells(self, truth: TruePoses) -> OccupancyMap:
+        """The map, aligned with the truth as a whole."""
         ...
 
     def errors(self, truth: TruePoses) -> dict[str, float]:
@@ -234,11 +238,13 @@ class _Run:
         path, coverage, times = np.array(self._rows).T
         poses, decisions = np.array(self._poses), np.array(self._decisions_ms)
         errors: dict[str, float] = {}
+        found = self.found
         if self._estimator is not None:
-            errors = self._estimator.errors(TruePoses(np.array(self._stamps_ns), poses))
+            truth = TruePoses(np.array(self._stamps_ns), poses)
+            errors, found = self._estimator.errors(truth), _trinary(self._estimator.aligned_cells(truth))
         true = _trinary(self._grid.cells(_OCCUPANCY))
         counted = self._collisions, self._ended
-        return Explored(path, coverage, times, poses, decisions, *counted, self.found, true, errors)
+        return Explored(path, coverage, times, poses, decisions, *counted, found, true, errors)
 
 
 def _trinary(found: OccupancyMap) -> OccupancyMap:

@@ -56,6 +56,22 @@ class OwnPoses:
             self._map.update(trajectory.stamps_ns, _placed(self._first, trajectory.poses_xyyaw))
         return self._map.cells()
 
+    def aligned_cells(self, truth: TruePoses) -> OccupancyMap:
+        """The map after the rigid motion that brings the trajectory nearest to the truth, as for ``ate_m``."""
+        trajectory = self._online.trajectory()
+        if trajectory is None:
+            return self._map.cells()
+        own = trajectory.poses_xyyaw[:, :2]
+        true = np.column_stack(
+            [np.interp(trajectory.stamps_ns, truth.stamps_ns, truth.poses_xyyaw[:, i]) for i in (0, 1)]
+        )
+        (x, y), (true_x, true_y) = (own - own.mean(axis=0)).T, (true - true.mean(axis=0)).T
+        yaw = np.arctan2((x * true_y - y * true_x).sum(), (x * true_x + y * true_y).sum())
+        turned = transformed(np.array((0.0, 0.0, yaw)), own)
+        first = np.array((*(true.mean(axis=0) - turned.mean(axis=0)), yaw))
+        self._map.update(trajectory.stamps_ns, _placed(first, trajectory.poses_xyyaw))
+        return self._map.cells()
+
     def errors(self, truth: TruePoses) -> dict[str, float]:
         """``ate_m`` of the whole trajectory as it is now, after the best rigid alignment, and ``within``.
 

@@ -56,7 +56,9 @@ class PathFollower:
 
         The map may lack what they show: panes that most rays pass through, people, doors that were open.
         """
-        self._hits, self._hits_s = hits_xy[np.hypot(*hits_xy.T) < _SEEN_M], seen_s
+        away_m = np.hypot(*hits_xy.T)
+        # What is far inside the robot is the robot itself.
+        self._hits, self._hits_s = hits_xy[(away_m > 0.8 * self._touch_m) & (away_m < _SEEN_M)], seen_s
 
     def step(self, known: KnownMap, robot_xyyaw: Floats, now_s: float, late_s: float = 0.0) -> tuple[float, float]:
         """Speed (m/s) and turn rate (rad/s) from now on; call it at a steady pace.
