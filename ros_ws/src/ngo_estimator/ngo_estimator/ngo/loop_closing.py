@@ -23,7 +23,7 @@ from ngo_estimator.ngo.loop_gates import (
     odometry_variances,
     unchained,
 )
-from ngo_estimator.ngo.meta_poses import ClosedLoops, GraphState, MetaSteps, Solution
+from ngo_estimator.ngo.meta_poses import BelievedLoops, GraphState, MetaSteps, Solution
 
 if TYPE_CHECKING:
     from ngo_estimator.graph.normal_equations import GraphStructure, NormalEquations
@@ -121,12 +121,12 @@ class LoopClosing:
         return torch.from_numpy(values).unsqueeze(0) if self._is_single else values
 
     @property
-    def closed(self) -> ClosedLoops:
+    def closed(self) -> BelievedLoops:
         """The loops of the last ``close``; raises ``RuntimeError`` before it."""
         if not self._begun:
             raise RuntimeError("no iteration has closed loops yet; expected look() and close() before")
         weights, information = self._returned(self._weights), self._returned(self._information)
-        return ClosedLoops(self._loops, weights, information, self._equations)
+        return BelievedLoops(self._loops, weights, information, self._equations)
 
     def look(self, state: GraphState, iteration: int) -> None:
         """Judge the loops under the current poses; the third iteration adds overlaps to them."""

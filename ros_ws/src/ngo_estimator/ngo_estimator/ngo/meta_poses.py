@@ -86,7 +86,7 @@ class GraphState:
 
 
 @dataclass(frozen=True)
-class ClosedLoops:
+class BelievedLoops:
     """The loops of an iteration, and the belief in them.
 
     ``weights`` ``(batch, loops)`` from zero to one, ``information`` ``(batch, loops, 3)`` (1/m^2, 1/m^2, 1/rad^2) along
@@ -137,7 +137,7 @@ class OptimizedMetaPoses:
 
     meta_relative: list[Tensor]
     step_std: Tensor
-    closed: ClosedLoops | None
+    closed: BelievedLoops | None
     corrections: list[Correction] = field(default_factory=list)
     left: int = 0
 

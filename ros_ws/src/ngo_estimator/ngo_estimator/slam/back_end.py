@@ -54,6 +54,8 @@ class BackEnd(ABC):
     def __init__(self, graph: PoseGraph) -> None:
         self.graph = graph
         self.closed = ClosedLoops.none()
+        self._waiting = 0
+        """Nodes since there is a loop that no optimisation has seen."""
         self.fault = ""
         """What failed in the last ``work`` or ``finish``, in words; empty where nothing did."""
         self.took_s = 0.0
@@ -118,7 +120,7 @@ class BackEnd(ABC):
     @property
     def unfinished(self) -> bool:
         """Whether there is anything left to optimise when ``work`` is done."""
-        return False
+        return self._waiting > 0
 
     def finish(self) -> bool:
         """Optimise what is left when no more frames come; returns whether there was anything, and it worked."""
@@ -157,9 +159,9 @@ class BackEnd(ABC):
         return None
 
     @property
-    @abstractmethod
     def window_fill(self) -> float:
-        """Share of the window that is in use."""
+        """Share of the window that is in use; zero where all nodes are optimised together."""
+        return 0.0
 
 
 def require_sound(poses: np.ndarray, end: np.ndarray) -> None:

@@ -35,7 +35,6 @@ class PictureBackEnd(BackEnd):
         self._corrector: Corrector = Robust(least_scale=1.0)
         self._is_key = False
         self._loops_from_nothing, self._scale = 0, np.ones(1)
-        self._waiting = 0  # keys since a loop was found that no optimisation has seen
 
     def checked(self, step: RelativeStep) -> RelativeStep:
         """See ``BackEnd.checked``; covariances are bounded."""
@@ -116,16 +115,6 @@ class PictureBackEnd(BackEnd):
     def waiting_loops(self) -> int:
         """Loops that wait for an optimisation."""
         return len(self._finder.loops) - len(self.closed)
-
-    @property
-    def unfinished(self) -> bool:
-        """Whether a loop waits for an optimisation."""
-        return self._waiting > 0
-
-    @property
-    def window_fill(self) -> float:
-        """All key pictures are optimised: there is no window to fill."""
-        return 0.0
 
     def finish(self) -> bool:
         """Optimise with all loops; returns whether there were any, and it worked."""

@@ -61,7 +61,6 @@ class ScanBackEnd(BackEnd):
         self._other_maps: dict[int, OwnMap] = {}  # by rank, of the streams that go on, but the last
         self._parts = np.zeros(0, np.int64)  # the part of the map that each segment is in, when that was asked last
         self._claimed = np.zeros(0, np.int64)  # used loops by which the robot was found since the last optimisation
-        self._waiting = 0  # keys since the last optimisation, where there is a loop that it has not seen
 
     def key_step(self, key: int) -> KeyScanStep:
         """A key scan and the step to it, as the odometry had them; of old scans rays tell what loops ask of them."""
@@ -397,16 +396,6 @@ class ScanBackEnd(BackEnd):
         begins = self._anchors(parts)[segment_of(self.graph.segments, ends)]
         pairs = zip(begins.tolist(), ends.tolist(), strict=True)
         return [_seen_from(equations, solution.poses, begin, end) for begin, end in pairs]
-
-    @property
-    def unfinished(self) -> bool:
-        """Whether a loop waits for an optimisation."""
-        return self._waiting > 0
-
-    @property
-    def window_fill(self) -> float:
-        """All key scans are optimised: there is no window to fill."""
-        return 0.0
 
     def finish(self) -> bool:
         """Optimise until nothing moves any more; returns whether there was anything to optimise, and it worked."""
