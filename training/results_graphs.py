@@ -26,8 +26,7 @@ from training.common import records
 from training.common.command_line import run_command
 from training.common.records import write_at_once
 from training.report import graphs_page
-from training.scoring.graph_blocks import Online, blocks
-from training.scoring.graph_problems import KINDS, JudgedProblem, lecture_hall, manhattan, synthetic
+from training.scoring.graph_problems import KINDS, JudgedProblem, Online, blocks, lecture_hall, manhattan, synthetic
 from training.scoring.statistics import Interval, mean_interval
 
 GRAPHS = ("synthetic_1000", "synthetic_3000", "hard_1000", "hard_3000", "lecture_hall", "manhattan")

@@ -5,6 +5,7 @@ A graph's truth is its true positions, or where nobody knows these the solution 
 
 import gzip
 import math
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -12,7 +13,7 @@ import numpy as np
 from scipy.spatial import KDTree
 
 from ngo_estimator.geometry.se2 import between, compose
-from ngo_estimator.graph.corrector import GraphProblem
+from ngo_estimator.graph.corrector import CorrectedGraph, Corrector, GraphProblem
 from ngo_estimator.graph.cycle_agreement import chain_poses
 from ngo_estimator.graph.relative_poses import RelativePoses
 from ngo_estimator.trajectory.chained_graph import chained
@@ -22,6 +23,9 @@ from training.baselines.lidar_peers import solve_with
 KINDS = ("random", "local", "grouped", "lookalike", "offset")
 """How loops are wrong: between any two nodes; near along the chain; in groups that agree; between long stretches that
 look alike; by one and the same offset."""
+
+BLOCK = 120
+"""Loops in a block of a graph that comes online."""
 
 _GROUP, _STRETCH = 10, 50
 _NEAR_M = 2.0  # of a loop's two nodes
@@ -196,3 +200,37 @@ def manhattan(folder: Path, kind: str, percent: float, seed: int) -> JudgedProbl
     loops = with_wrong(right, true, kind, percent, rng)
     problem = GraphProblem(start, steps, loops, np.ones(len(loops)))
     return JudgedProblem(problem, true[:, :2], np.arange(len(loops)) < len(right), _LEAST_ATE_M)
+
+
+def blocks(judged: JudgedProblem) -> Iterator[JudgedProblem]:
+    """The graph as a robot builds it, after each block of loops in order of their later nodes.
+
+    The last one is whole, but for nodes behind its last loop.
+    """
+    problem = judged.problem
+    order = np.argsort(problem.loops.nodes.max(axis=1), kind="stable")
+    for end in range(BLOCK, len(order) + BLOCK, BLOCK):
+        rows = order[:end]
+        nodes = int(problem.loops.nodes[rows].max()) + 1
+        steps, loops = problem.steps[: nodes - 1], problem.loops[rows]
+        part = GraphProblem(problem.poses[:nodes], steps, loops, problem.trust[rows])
+        yield JudgedProblem(part, judged.truth[:nodes], judged.right[rows], judged.least_ate_m)
+
+
+class Online:
+    """Corrects the blocks of one graph, each from the solution of the one before it."""
+
+    def __init__(self, corrector: Corrector) -> None:
+        self._corrector = corrector
+        self._last: CorrectedGraph | None = None
+        self.changed = self.verdicts = 0
+        """Verdicts about known loops that changed, and all of them."""
+
+    def correct(self, problem: GraphProblem) -> CorrectedGraph:
+        """The solution of the next block."""
+        before, self._last = self._last, self._corrector.correct(problem, self._last)
+        if before is not None:
+            known = len(before.loop_weights)
+            self.changed += int((before.loop_weights != self._last.loop_weights[:known]).sum())
+            self.verdicts += known
+        return self._last

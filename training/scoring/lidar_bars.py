@@ -1,4 +1,4 @@
-"""What the lidar's results must reach, and whether they do."""
+"""What the lidar's results must reach, on logs as they are and after changes, and whether they do."""
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 
+from training.scoring.stress_cells import CLEAN
 from training.scoring.table import Measured
 
 Table = Mapping[str, Mapping[str, Measured]]
@@ -152,3 +153,46 @@ def _covariance_bars(tables: Mapping[str, Table]) -> Iterator[Bar]:
 
 def _of(rows: Mapping[str, Measured], row: str) -> dict[str, np.ndarray]:
     return rows[row].errors if row in rows else {}
+
+
+StressLogs = Mapping[str, Mapping[str, Mapping[str, Mapping[str, Any]]]]
+"""``LOG.CHANGE.ROW.KEY`` as in the JSON."""
+
+_TIMES_CLEAN = 1.3
+_LESS_SEEN = {"noise_5cm": 1.6, "range_5m": 1.6, "quarter_of_rays": 1.6}
+_METRES = {
+    "no_scans_for_10s": ("at_scans_m", 0.06),
+    "carried_while_paused": ("at_scans_m", 0.1),
+    "half_covered": ("translation_m", 0.15),
+    "people": ("translation_m", 0.15),
+}
+_TIMES_POSSIBLE = {"one_scan_in_ten": 2.0}
+_WITHOUT_WHEELS = 2.0
+
+
+def stress_bars(logs: StressLogs) -> Iterator[Bar]:
+    """The bars of all rows of ours that are known: an error after each change, and no harm to the wheels' odometry.
+
+    Most changes may cost 1.3 times the error without them. Without wheels an error may be twice as large.
+    """
+    for log, changes in logs.items():
+        for change, rows in changes.items():
+            for row in OURS:
+                numbers, clean = rows.get(row, {}), changes.get(CLEAN, {}).get(row, {})
+                if change == CLEAN or "translation_m" not in numbers or "translation_m" not in clean:
+                    continue
+                key, most = _limit(change, numbers, clean)
+                if key in numbers:
+                    most *= 1.0 if row == "ours" else _WITHOUT_WHEELS
+                    yield Bar(f"{log}, {change}, {row}, {key}", numbers[key], most=most)
+            ours_m, wheels_m = (rows.get(row, {}).get("translation_m") for row in ("ours", "wheels"))
+            if ours_m is not None and wheels_m is not None:
+                yield Bar(f"{log}, {change}, ours beside wheels", ours_m, most=_HARM * wheels_m)
+
+
+def _limit(change: str, numbers: Mapping[str, float], clean: Mapping[str, float]) -> tuple[str, float]:
+    if change in _METRES:
+        return _METRES[change]
+    if change in _TIMES_POSSIBLE:
+        return "translation_m", _TIMES_POSSIBLE[change] * numbers["best_possible_m"]
+    return "translation_m", _LESS_SEEN.get(change, _TIMES_CLEAN) * clean["translation_m"]

@@ -13,8 +13,7 @@ from ngo_estimator.graph.robust import Robust
 from training import results_graphs
 from training.baselines import graph_peers
 from training.baselines.lidar_peers import solve_with
-from training.scoring.graph_blocks import blocks
-from training.scoring.graph_problems import KINDS, JudgedProblem, synthetic
+from training.scoring.graph_problems import KINDS, JudgedProblem, blocks, synthetic
 
 
 @pytest.mark.parametrize("kind", KINDS)

@@ -1,13 +1,20 @@
+"""The stress tables: numbers of a cell, of simulated drives and of a car's loop, and the bars."""
+
 import gzip
+import math
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+from ngo_estimator.geometry.planar_motion import all_between, compose
 from training.data.lidar_drives import Relations
 from training.scoring import stress_cells
+from training.scoring.lidar_bars import stress_bars
 from training.scoring.lidar_rows import DriveRuns, Estimate, Row
+from training.scoring.second_visit import second_visit
 from training.scoring.stress_cells import StressLog, cell_numbers, cell_of
+from training.scoring.stress_rows import last_loop_error_m, wrong_joins
 
 S = 1_000_000_000
 TAKEN = S * np.arange(1, 101)
@@ -109,3 +116,91 @@ def test_rows_without_wheels_see_no_change_of_them(tmp_path: Path, monkeypatch: 
     for change, seed in (("clean", 0), ("clean", 1), ("wheels_spin", 1)):
         assert list(log.cells(change, seed, rows)) == list(rows)
     assert asked == ["straight, clean, 0"] * 2 + ["straight, wheels_spin, 1"]
+
+
+def out_and_back(way_m: float) -> np.ndarray:
+    """Along x, around, and back, a pose each 0.25 m."""
+    out = np.arange(0.0, way_m, 0.25)
+    there = np.stack((out, np.zeros_like(out), np.zeros_like(out)), axis=-1)
+    return np.concatenate((there, there[::-1] + (0.0, 0.2, math.pi)))
+
+
+def test_the_last_loop_is_wrong_by_the_drift_since_the_first_visit() -> None:
+    truth = out_and_back(60.0)
+    assert last_loop_error_m(truth, truth) == pytest.approx(0.0, abs=1e-9)
+    drifted = truth.copy()
+    drifted[len(truth) // 2 :, 1] += 2.5
+    assert last_loop_error_m(truth, drifted) == pytest.approx(2.5)
+    drifted[:20] += (0.0, 2.5, 0.0)  # the start is off as well: only the visits of the last metres count
+    assert last_loop_error_m(truth, drifted) == pytest.approx(0.0, abs=1e-9)
+
+
+def test_without_a_loop_there_is_no_error() -> None:
+    straight = out_and_back(60.0)[:240]
+    assert math.isnan(last_loop_error_m(straight, straight))
+    assert math.isnan(last_loop_error_m(out_and_back(20.0), out_and_back(20.0)))  # too little way between
+
+
+def test_a_join_is_wrong_by_half_a_metre_or_five_degrees() -> None:
+    truth = np.array([(0.0, 0.0, math.pi / 2), (0.0, 3.0, math.pi), (10_000.0, 0.0, 0.0)])
+    pairs = np.array([(0, 1), (0, 1), (0, 1), (0, 2), (1, 0)])
+    right = np.array((3.0, 0.0, math.pi / 2))
+    relative = np.array([right, right + (0.4, 0.2, 0.05), right + (0.0, 0.6, 0.0), right, (0.0, 3.0, -1.4)])
+    assert wrong_joins(truth, pairs, relative).tolist() == [False, False, True, True, True]
+    relative[4, 2] = -math.pi / 2 + 2 * math.pi
+    assert wrong_joins(truth, pairs, relative).tolist() == [False, False, True, True, False]
+
+
+def numbers(metres: float, **more: float) -> dict[str, float]:
+    return {"translation_m": metres, **more}
+
+
+def test_bars_follow_from_the_error_without_a_change() -> None:
+    rows = {
+        "clean": {"wheels": numbers(1.0), "ours": numbers(0.1), "ours_without_wheels": numbers(0.2)},
+        "scans_bunched": {"wheels": numbers(1.0), "ours": numbers(1.2), "ours_without_wheels": numbers(0.5)},
+        "noise_5cm": {"ours": numbers(0.15)},
+        "carried_while_paused": {"ours": numbers(3.0, at_scans_m=0.2)},
+        "one_scan_in_ten": {"ours": numbers(0.5, best_possible_m=0.3)},
+        "people": {"ours": {"failed": {"0": "no trajectory"}}, "kiss_icp": numbers(1.0)},
+    }
+    found = {bar.name: (bar.value, bar.most, bar.met) for bar in stress_bars({"log": rows})}
+    expected = {
+        "log, clean, ours beside wheels": (0.1, 1.05, True),
+        "log, scans_bunched, ours, translation_m": (1.2, 0.13, False),
+        "log, scans_bunched, ours_without_wheels, translation_m": (0.5, 2 * 0.26, True),
+        "log, scans_bunched, ours beside wheels": (1.2, 1.05, False),
+        "log, noise_5cm, ours, translation_m": (0.15, 0.16, True),
+        "log, carried_while_paused, ours, at_scans_m": (0.2, 0.1, False),
+        "log, one_scan_in_ten, ours, translation_m": (0.5, 0.6, True),
+    }
+    assert {name: (value, pytest.approx(most), met) for name, (value, most, met) in expected.items()} == found
+
+
+WALLS = np.random.default_rng(0).uniform(-60.0, 60.0, (4000, 2))
+
+
+def ring() -> np.ndarray:
+    """Poses along a circle of 40 m radius, and 25 m of it once more."""
+    angle = np.arange(0.0, 2.0 * math.pi + 25.0 / 40.0, 0.01)
+    return np.stack((40.0 * np.sin(angle), 40.0 - 40.0 * np.cos(angle), angle), axis=-1)
+
+
+def seen(poses: np.ndarray) -> list[np.ndarray]:
+    """What lies within 20 m of each pose, in its frame."""
+    points = np.pad(WALLS + (0.0, 40.0), ((0, 0), (0, 1)))
+    frames = (all_between(pose[None], points)[:, :2] for pose in poses)
+    return [near[np.hypot(*near.T) < 20.0] for near in frames]
+
+
+@pytest.mark.parametrize("motion", [(0.0, 0.0, 0.0), (3.0, -4.0, 0.0), (-8.0, 0.5, math.radians(7.0))])
+def test_a_second_visit_lies_where_it_was_put(motion: tuple[float, float, float]) -> None:
+    poses = ring()
+    last = slice(len(poses) - 51, None)  # poses are 0.4 m apart
+    moved, middle = poses.copy(), np.array((*poses[last, :2].mean(axis=0), 0.0))
+    moved[last] = [compose(middle, compose(np.array(motion), pose - middle)) for pose in poses[last]]
+    found = second_visit(seen(poses), moved)
+    assert found.metres == pytest.approx(math.hypot(*motion[:2]), abs=0.1)
+    assert found.degrees == pytest.approx(math.degrees(motion[2]), abs=0.2)
+    assert found.share > 0.9
+    assert found.share_before > 0.9 if not any(motion) else found.share_before < 0.5
