@@ -1,4 +1,4 @@
-"""The table of Doom maps from networks that learned nothing: choices, JSON and page."""
+"""Small tables on Doom maps and of maps."""
 
 import dataclasses
 import json
@@ -7,8 +7,10 @@ from pathlib import Path
 import pytest
 
 from ngo_estimator.checkpoint import OPTIMIZER, load_place, save_checkpoint, write_untrained
-from training import results_doom, train_loop_judge, tune_doom
+from training import results_doom, results_map, train_loop_judge, tune_doom
 from training.scoring.doom_rows import METRICS, ROWS
+
+pytestmark = pytest.mark.slow
 
 
 def test_choices_and_table_with_little(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -38,3 +40,17 @@ def test_choices_and_table_with_little(tmp_path: Path, monkeypatch: pytest.Monke
     page = (tmp_path / "docs" / "results_doom.md").read_text()
     assert "take_cover" in page and all(f"`{row}`" in page for row in ROWS)
     assert (tmp_path / "docs" / "images" / "results_doom_maps.png").stat().st_size > 1000
+
+
+def test_the_table_of_one_world(tmp_path: Path) -> None:
+    folders = {"out": tmp_path, "docs": tmp_path, "runs": tmp_path / "runs"}
+    results_map.main(results_map.Arguments(worlds=("maze2d",), split="validation", mazes=2, frames=40, **folders))
+    result = json.loads((tmp_path / "map.json").read_text())
+    table = result["tables"]["maze2d"]
+    assert list(table) == ["odometry", "corrected", "true"]
+    for entry in table.values():
+        assert 0.0 <= entry["occupied_iou"]["ci95"][0] <= entry["occupied_iou"]["mean"] <= 1.0
+    assert table["true"]["free_iou"]["mean"] > 0.8
+    assert result["skipped"] == ["logs: no folder is given (--logs), or it has none"]
+    page = (tmp_path / "results_map.md").read_text()
+    assert "| `maze2d` | corrected |" in page

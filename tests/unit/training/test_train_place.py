@@ -1,4 +1,4 @@
-"""What the place encoder learns, and what it begins with."""
+"""What the trainings of places, familiarity and loops learn, and what they begin with."""
 
 import dataclasses
 from pathlib import Path
@@ -9,10 +9,15 @@ from torch import Tensor
 
 from ngo_estimator.checkpoint import PLACE, PlaceNetworks, load_place, save_checkpoint, write_untrained
 from ngo_estimator.geometry.scan_registration import RegistrationConfig
+from ngo_estimator.networks.familiarity import FamiliarityConfig
 from ngo_estimator.networks.place_encoder import SeenRanges
+from ngo_estimator.ngo.loop_judge import EVIDENCE
 from training.common.records import RunError
 from training.data.worlds import world_named
 from training.recordings.recording_source import RecordedArguments
+from training.train_familiarity import Seen, dishonest, fit
+from training.train_loop_judge import Arguments as JudgeArguments
+from training.train_loop_judge import Judged, learn
 from training.train_place import Arguments, PlaceTraining, initial_networks
 
 WORLD = world_named("maze3d")
@@ -54,3 +59,47 @@ def test_weights_that_see_ranges_learn_on_from_recordings_without_them(tmp_path:
     assert torch.equal(seeing.encoder.ranges.out.weight, begun.encoder.ranges.out.weight)
     with pytest.raises(RunError, match=r"has the registration RegistrationConfig\(rays=9.*expected .*rays=81"):
         initial_networks(arguments, WORLD)
+
+
+def _drive(config: FamiliarityConfig, steps: int = 400) -> Seen:
+    truth = torch.tensor([0.1, 0.0, 0.02]) + torch.randn(steps, 3) * torch.tensor([0.03, 0.01, 0.05])
+    return Seen(
+        looks=torch.randn(steps, config.look_size),
+        motions=torch.randn(steps, config.motion_size),
+        told=torch.ones(steps, 1),
+        relative=truth,
+        change=torch.rand(steps) + 0.5,
+        truth=truth,
+    )
+
+
+def test_an_unknown_step_is_a_step_of_the_robot_and_limits_of_few_drives_have_a_margin() -> None:
+    torch.manual_seed(0)
+    config = FamiliarityConfig(8, 4, actions=0, twist=False)
+    seen, held_out = [_drive(config)], [_drive(config)]
+    fitted = fit(config, seen, held_out).config
+    # Deviations of a stretch add up: those of one step must not allow for a stretch.
+    assert 0.02 < fitted.told_std[0] < 0.04 and 0.04 < fitted.told_std[2] < 0.06
+    wider = fit(config, seen, held_out, margin=1.25).config
+    assert [round(b / a, 6) for a, b in zip(fitted.limits, wider.limits, strict=True) if a < 1e8] == [1.25, 1.25, 1.25]
+
+
+def test_faults_that_stay_outside_of_their_deviations_are_named() -> None:
+    assert dishonest({"noise": 0.98, "black": 0.9}) == "black (90.0%)"
+    assert dishonest({"noise": 0.97}) == dishonest({}) == ""
+
+
+def test_it_learns_which_loops_are_true_and_how_far_off_these_are() -> None:
+    torch.manual_seed(0)
+    evidence = torch.randn(400, EVIDENCE)
+    true, noisy = evidence[:, 0] > 0.0, evidence[:, 1] > 0.0
+    off_m = torch.where(true, torch.where(noisy, 0.4, 0.04), torch.tensor(5.0))
+    loops = Judged(evidence, torch.zeros(400, 2), torch.stack((off_m, 0.02 * torch.ones(400)), -1), torch.ones(400))
+    logit, factor = learn(loops, 200, 1e-2)(evidence)
+    assert ((logit > 0.0) == true).double().mean() > 0.95
+    assert factor[true & noisy, 0].mean() > factor[true & ~noisy, 0].mean() + 1.0
+
+
+def test_it_learns_from_no_drive_that_ranges_are_learned_from() -> None:
+    with pytest.raises(ValueError, match="drives is 111; expected 1 to 110"):
+        JudgeArguments(drives=111)

@@ -1,10 +1,12 @@
-"""The local pose network: shapes, units, batches, actions."""
+"""The local network: its layers, normalisation, and what it is told of a step."""
 
 import dataclasses
 
 import pytest
 import torch
+from torch import nn
 
+from ngo_estimator.networks.flownet import FlowNetConvolutions
 from ngo_estimator.networks.local_pose_network import NO_ACTION, LocalPoseNetwork
 from tests.unit.ngo_estimator.samples import WORLDS, local_config, observations
 
@@ -106,3 +108,10 @@ def test_the_velocity_is_told_in_its_own_units_and_the_mirrored_one_in_a_mirror(
     assert torch.allclose(scaled(images[:1], images[1:], None, twist * torch.tensor([2.0, 4.0, 8.0]))[0], mean)
     in_the_mirror = network(images[:1].flip(-2), images[1:].flip(-2), None, twist * flip)[0]
     assert torch.allclose(in_the_mirror, mean * flip, atol=1e-6)
+
+
+def test_width_one_is_flownet_simple() -> None:
+    convolutions = [m for m in FlowNetConvolutions(6, (60, 80), 1.0).layers if isinstance(m, nn.Conv2d)]
+    assert [m.out_channels for m in convolutions] == [64, 128, 256, 256, 512, 512, 512, 512, 1024]
+    assert [m.kernel_size[0] for m in convolutions] == [7, 5, 5, 3, 3, 3, 3, 3, 3]
+    assert [m.stride[0] for m in convolutions] == [2, 2, 2, 1, 2, 1, 2, 1, 2]

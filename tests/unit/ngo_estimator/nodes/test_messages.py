@@ -1,17 +1,28 @@
-"""Between ROS messages and arrays: what goes in comes out, over the wire, and what cannot be used is named."""
+"""Messages say what the cores say, and are written as fast as arrays."""
 
 from typing import Any
 
 import numpy as np
 import pytest
 from geometry_msgs.msg import PoseWithCovarianceStamped, Twist, TwistStamped, Vector3
-from nav_msgs.msg import Odometry
-from ngo_msgs.msg import RelativePose, Trajectory
+from nav_msgs.msg import Odometry, Path
+from ngo_msgs.msg import KeyScan, RelativePose, Trajectory
 from rclpy.serialization import deserialize_message, serialize_message
+from rosbags.typesys import Stores, get_typestore
+from visualization_msgs.msg import Marker, MarkerArray
 
+from ngo_estimator.data.relative_step import RelativeStep
 from ngo_estimator.frontend.camera.local_odometry import LocalEstimate
 from ngo_estimator.nodes import messages
+from ngo_estimator.nodes.loop_message import LoopMarkerWriter, loop_colors, plain_loops
+from ngo_estimator.nodes.messages import relative_pose_message, relative_step
+from ngo_estimator.nodes.path_message import PathWriter, plain_path
+from ngo_estimator.nodes.step_messages import TYPES, StepMessages
+from ngo_estimator.slam.scan_trajectory import ScanTrajectory
 from ngo_estimator.slam.trajectory_update import Trajectory as WholeTrajectory
+from ngo_estimator.slam.trajectory_update import TrajectoryUpdate
+from tests.unit.ngo_estimator.lidar_steps import lidar_steps
+from tests.unit.ngo_estimator.ray_casting import ROOM, scan_at
 
 
 def over_the_wire(message: Any) -> Any:
@@ -144,3 +155,154 @@ def test_what_is_wrong_with_an_initial_pose_is_named(changes: dict[str, Any], re
     with pytest.raises(ValueError, match=f"^pose {reason}") as error:
         messages.planar_estimate(given_pose(**changes), "map")
     assert "\n" not in str(error.value)
+
+
+def trajectory(frames: int, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+    """Stamps over several seconds and days, and poses, of `frames` frames."""
+    stamps_ns = np.cumsum(rng.integers(1, 10**14, frames)).astype(np.int64)
+    return stamps_ns, rng.normal(0.0, 10.0, (frames, 3))
+
+
+@pytest.mark.parametrize("frame_id", ["map", "m", "mapp", "a_long_frame/of_many_parts", "käfig"])
+def test_equals_the_plain_message_for_every_length_in_any_order(frame_id: str) -> None:
+    rng = np.random.default_rng(0)
+    writer = PathWriter(frame_id)
+    for frames in [*range(51), 2000, 2, 50, 0, 1, 777]:
+        stamps_ns, poses_xyyaw = trajectory(frames, rng)
+        read = deserialize_message(writer.write(10**18 + 5, stamps_ns, poses_xyyaw), Path)
+        assert read == plain_path(frame_id, 10**18 + 5, stamps_ns, poses_xyyaw), frames
+
+
+def test_two_messages_share_no_memory() -> None:
+    rng = np.random.default_rng(1)
+    writer = PathWriter("map")
+    stamps_ns, poses_xyyaw = trajectory(5, rng)
+    first = writer.write(1, stamps_ns, poses_xyyaw)
+    writer.write(2, stamps_ns + 7, poses_xyyaw + 1.0)
+    assert deserialize_message(first, Path) == plain_path("map", 1, stamps_ns, poses_xyyaw)
+
+
+def with_loops(loops: int, frames: int = 500) -> WholeTrajectory:
+    """A trajectory with so many loops, some of them with weights beyond 0 and 1."""
+    rng = np.random.default_rng(loops)
+    return WholeTrajectory(
+        stamps_ns=np.arange(1, frames + 1) * 1_500_000_001,
+        poses_xyyaw=rng.normal(0.0, 10.0, (frames, 3)),
+        odometry_xyyaw=rng.normal(size=(frames, 3)),
+        online_xyyaw=rng.normal(size=(frames, 3)),
+        moved_m=rng.random(frames),
+        loops=rng.integers(0, frames, (loops, 2)),
+        odometry_std=rng.random((frames - 1, 3)),
+        loop_weights=rng.uniform(-0.5, 1.5, loops),
+        loop_relative_xyyaw=rng.normal(size=(loops, 3)),
+        loop_std=rng.random((loops, 3)),
+    )
+
+
+@pytest.mark.parametrize("frame_id", ["map", "m", "mapp", "a_long_frame/of_many_parts", "käfig"])
+def test_equals_the_plain_message_for_any_number_of_loops(frame_id: str) -> None:
+    writer = LoopMarkerWriter(frame_id)
+    for loops in (3, 1, 512, 0, 2):
+        given = with_loops(loops)
+        read = deserialize_message(writer.write(given), MarkerArray)
+        ends, stamp_ns = given.poses_xyyaw[given.loops.reshape(-1), :2], int(given.stamps_ns[-1])
+        plain = plain_loops(frame_id, stamp_ns, ends, np.repeat(loop_colors(given.loop_weights), 2, axis=0))
+        assert read == deserialize_message(serialize_message(plain), MarkerArray), loops
+        (marker,) = read.markers
+        assert marker.action == (Marker.ADD if loops else Marker.DELETE)
+        assert (marker.type, marker.header.frame_id) == (Marker.LINE_LIST, frame_id)
+        assert [(point.x, point.y) for point in marker.points] == [tuple(end) for end in ends.tolist()]
+
+
+def test_what_is_thought_of_a_loop_shows_in_its_color() -> None:
+    believed, faint, doubted, refused = loop_colors(np.array((1.0, 0.6, 0.3, 0.0)))
+    assert believed[2] == faint[2] == max(believed[:3]) and (believed[3], faint[3]) == (1.0, 0.6)  # blue
+    assert doubted[0] == max(doubted[:3]) and doubted[1] > 0.5 > refused[1]  # orange and red
+    assert refused[0] == max(refused[:3]) and doubted[3] == refused[3] > 0.0
+
+
+@pytest.mark.parametrize("frames", [("base_link", "odom", "map"), ("b", "my_robot/odom", "käfig")])
+def test_equal_the_plain_messages_for_each_step(frames: tuple[str, str, str]) -> None:
+    store, rng, nothing = get_typestore(Stores.ROS2_JAZZY), np.random.default_rng(20000), np.zeros(0, np.float32)
+
+    def serialised(message: object, type_name: str) -> bytes:
+        return bytes(store.serialize_cdr(message, type_name))
+
+    writer = StepMessages(*frames, serialised)
+    for number in range(20):
+        begin_ns, end_ns = np.sort(rng.integers(1, 2 * 10**18, 2)).tolist()
+        root, poses = rng.normal(size=(3, 3, 3)), rng.normal(0.0, 10.0, (5, 3))
+        odometry, step_covariance, covariance = root @ root.mT
+        robot = poses[4] if number % 2 else None
+        step = RelativeStep(
+            end_ns, begin_ns, poses[0], step_covariance, 0, poses[1], nothing, nothing, robot_odom_xyyaw=robot
+        )
+        update = TrajectoryUpdate(end_ns, poses[2], covariance, poses[3], 2, False, False, False, 0.0, 0, 0.0, "")
+        plain = writer.plain(step, odometry, update)
+        assert writer.of(step, odometry, update) == {
+            topic: serialised(message, TYPES[topic]) for topic, message in plain.items()
+        }
+
+
+POSES = np.column_stack((0.1 * np.arange(8), np.zeros(8), np.zeros(8)))
+STEPS = list(lidar_steps(POSES, lambda k, stamp_ns: scan_at(ROOM, POSES[k] + (1.0, 1.0, 0.3), stamp_ns)))
+KEY = next(k for k, step in enumerate(STEPS) if step.key is not None)
+
+
+def message(**changes: Any) -> RelativePose:
+    made: RelativePose = relative_pose_message(STEPS[KEY], "base_link")
+    for name, value in changes.items():
+        setattr(made.key_scan[0], name, value)
+    return made
+
+
+def test_a_key_scan_comes_as_it_was_sent() -> None:
+    sent, step = STEPS[KEY].key, relative_step(message())
+    assert sent is not None and step.key is not None
+    for part in ("points", "normals", "angles", "ranges", "sensor_xyyaw"):
+        np.testing.assert_array_equal(getattr(step.key.scan, part), getattr(sent.scan, part))
+    assert step.key.scan.stamp_ns == sent.scan.stamp_ns and step.key.from_key_stamp_ns == sent.from_key_stamp_ns
+    np.testing.assert_array_equal(step.key.covariance, sent.covariance)
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"points": [1.0, 2.0, 3.0]},
+        {"points": []},
+        {"normals": [1.0] * 4},
+        {"points": [float("nan")] * 4, "normals": [0.0] * 4},
+        {"points": [1e30] * 4, "normals": [0.0] * 4},
+        {"points": [1.0] * 200_000, "normals": [0.0] * 200_000},
+        {"angles": [0.0] * 500_000, "ranges": [1.0] * 500_000},
+        {"angles": [0.0]},
+        {"angles": [float("inf")], "ranges": [1.0]},
+        {"max_range": 0.0},
+        {"max_range": float("inf")},
+        {"sensor": [float("nan"), 0.0, 0.0]},
+        {"covariance": [float("nan")] * 9},
+        {"covariance": [0.0] * 9},
+        {"x": float("nan")},
+        {"stamp": KeyScan().stamp},
+    ],
+    ids=str,
+)
+def test_a_bad_key_scan_is_refused_in_one_line(changes: dict[str, Any]) -> None:
+    trajectory = ScanTrajectory()
+    for step in STEPS[:KEY]:
+        trajectory.update(step)
+    before = trajectory.trajectory()
+    with pytest.raises(ValueError, match=r"expected|finite") as told:
+        trajectory.update(relative_step(message(**changes)))
+    after = trajectory.trajectory()
+    assert "\n" not in str(told.value) and len(str(told.value)) < 400
+    assert before is not None and after is not None and before.poses_xyyaw.tobytes() == after.poses_xyyaw.tobytes()
+    assert not trajectory.update(relative_step(message())).gap
+
+
+@pytest.mark.parametrize("values", [[1.0], [1.0, 2.0, 3.0, 4.0], [0.0, float("nan"), 0.0]])
+def test_a_bad_pose_of_the_robots_odometry_is_refused(values: list[float]) -> None:
+    made = message()
+    made.robot_odom = values
+    with pytest.raises(ValueError, match="robot_odom_xyyaw"):
+        ScanTrajectory().update(relative_step(made))

@@ -1,5 +1,6 @@
-"""What nodes compile before the first frame comes."""
+"""What is compiled before it is needed, and what is said while it lasts."""
 
+import threading
 from pathlib import Path
 
 import numpy as np
@@ -9,11 +10,46 @@ from ngo_estimator.frontend.lidar import motion_mixture, velocity_filter
 from ngo_estimator.geometry import branch_and_bound, mode_search, scan_matching, scan_points, scan_registration_kernels
 from ngo_estimator.graph import block_cholesky, loop_errors, normal_equations
 from ngo_estimator.loops import shared_views_kernel
+from ngo_estimator.offline import compiling
 from ngo_estimator.offline.warm_up_scans import warm_up_scans
 from ngo_estimator.offline.warm_up_trajectory import warm_up_networks
 from ngo_estimator.slam.online_trajectory import OnlineTrajectory
 from tests.unit.ngo_estimator.samples import small_optimizer, small_pair_head
 from tests.unit.ngo_estimator.slam.test_online_trajectory import make_steps
+
+
+def test_what_takes_long_is_said_while_it_lasts(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(compiling, "_SILENT_S", 0.01)
+    said = threading.Event()
+    lines: list[str] = []
+
+    def say(line: str) -> None:
+        lines.append(line)
+        said.set()
+
+    with compiling.compiling(say):
+        assert said.wait(30.0)
+    assert len(lines) == 1 and lines[0].startswith("compiles, once after an installation")
+
+
+def test_what_is_short_or_fails_is_not_said(monkeypatch: pytest.MonkeyPatch) -> None:
+    timers: list[threading.Timer] = []
+
+    class Kept(threading.Timer):
+        def start(self) -> None:
+            timers.append(self)
+            super().start()
+
+    monkeypatch.setattr(threading, "Timer", Kept)
+    lines: list[str] = []
+    with compiling.compiling(lines.append):
+        pass
+    with pytest.raises(ValueError, match="weights"), compiling.compiling(lines.append):
+        raise ValueError("weights")
+    for timer in timers:
+        timer.join(30.0)
+    assert len(timers) == 2 and lines == []
+
 
 WEIGHTS = Path(__file__).parents[4] / "ros_ws/src/ngo_estimator/weights"
 

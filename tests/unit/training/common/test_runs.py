@@ -1,13 +1,21 @@
-"""The record of how a network was made, and the folder of its training."""
+"""What a training keeps: precision, learning curves, and the run that goes on."""
 
+import csv
 import json
+import subprocess
+import sys
 from dataclasses import dataclass
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import pytest
+import torch
 import tyro
 
-from training.common import records, runs
+from training.common import curves, precision, records, runs
+from training.common.curves import Curves, memory_mb
+from training.common.precision import resolved
 from training.common.trainer_arguments import TrainerArguments
 
 
@@ -94,3 +102,113 @@ def test_a_run_does_not_go_on_with_other_arguments(tmp_path: Path) -> None:
 def test_a_training_on_machines_that_nothing_started_together_is_refused(nodes: int, tmp_path: Path) -> None:
     with pytest.raises(records.RunError, match=f"--num-nodes is {nodes}, and this process was started alone"):
         begin(tmp_path, num_nodes=nodes)
+
+
+def trainer(epoch: int, **metrics: float) -> Any:
+    return SimpleNamespace(
+        current_epoch=epoch,
+        global_step=10 * (epoch + 1),
+        world_size=2,
+        is_global_zero=True,
+        callback_metrics={name: torch.tensor(value) for name, value in metrics.items()},
+    )
+
+
+def epoch(callback: Curves, number: int, clock: list[float], **metrics: float) -> None:
+    """Ten batches of three datapoints in each of two processes, in four seconds."""
+    now = trainer(number, **metrics)
+    for index in range(10):
+        callback.on_train_batch_end(now, SimpleNamespace(), None, {"x": torch.zeros(3, 7)}, index)  # type: ignore[arg-type]
+    clock[0] += 4.0
+    callback.on_train_epoch_end(now, SimpleNamespace())  # type: ignore[arg-type]
+
+
+@pytest.fixture
+def clock(monkeypatch: pytest.MonkeyPatch) -> list[float]:
+    now = [100.0]
+    monkeypatch.setattr(curves, "time", SimpleNamespace(monotonic=lambda: now[0]))
+    return now
+
+
+def test_the_curve_of_an_interrupted_training_has_every_epoch_once(tmp_path: Path, clock: list[float]) -> None:
+    path = tmp_path / "run" / "metrics.csv"
+    first = Curves(path)
+    first.on_fit_start(trainer(0), SimpleNamespace())  # type: ignore[arg-type]
+    epoch(first, 0, clock, loss=3.0)
+    saved = first.state_dict()
+    epoch(first, 1, clock, loss=9.0)  # written, but killed before the checkpoint
+
+    clock[0] += 1000.0
+    second = Curves(path)
+    second.load_state_dict(saved)
+    second.on_fit_start(trainer(1), SimpleNamespace())  # type: ignore[arg-type]
+    epoch(second, 1, clock, loss=2.0, validation=0.123456789)
+    rows = list(csv.DictReader(path.open()))
+    assert [(row["epoch"], row["step"], row["seconds"], row["loss"]) for row in rows] == [
+        ("0", "10", "4", "3"),
+        ("1", "20", "8", "2"),
+    ]
+    assert [row["validation"] for row in rows] == ["", "0.1234568"]
+    figures = second.figures()
+    assert figures["seconds"] == 8.0
+    assert figures["datapoints_per_s"] == 2 * 10 * 3 * 2 / 8.0
+
+
+def test_an_unfinished_epoch_counts_nowhere(tmp_path: Path, clock: list[float]) -> None:
+    callback = Curves(tmp_path / "metrics.csv", lambda batch: batch["x"].numel())
+    epoch(callback, 0, clock)
+    clock[0] += 50.0
+    callback.on_train_batch_end(trainer(1), SimpleNamespace(), None, {"x": torch.zeros(3, 7)}, 0)  # type: ignore[arg-type]
+    assert callback.figures()["seconds"] == 4.0
+    assert callback.figures()["datapoints_per_s"] == 2 * 10 * 3 * 7 / 4.0
+
+
+def test_memory_counts_what_child_processes_hold() -> None:
+    before = memory_mb()
+    assert before > 20.0
+    hold = "import sys; x = bytearray(b'1') * 200_000_000; print('ready', flush=True); sys.stdin.read()"
+    command = [sys.executable, "-S", "-c", hold]
+    with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as child:
+        assert child.stdout is not None
+        assert child.stdout.readline() == "ready\n"
+        assert memory_mb() > before + 180.0
+        child.communicate("")
+    assert memory_mb() < before + 100.0
+
+
+@pytest.mark.parametrize(("gain", "expected"), [(0.6, "32-true"), (1.2, "32-true"), (1.3, "bf16-mixed")])
+def test_a_cpu_gets_bfloat16_only_where_that_is_clearly_faster(
+    gain: float, expected: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(precision, "cpu_gain", lambda: gain)
+    assert resolved("cpu", "auto", 1) == (expected, f"on this CPU bfloat16 has {gain:.2f} times the speed of float32")
+
+
+@pytest.mark.parametrize(("supported", "expected"), [(True, "bf16-mixed"), (False, "32-true")])
+def test_a_gpu_says_what_it_can(supported: bool, expected: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
+    monkeypatch.setattr(torch.cuda, "is_bf16_supported", lambda **_: supported)
+    assert resolved("auto", "auto", 1)[0] == resolved("gpu", "2", 1)[0] == expected
+
+
+def test_a_run_says_its_precision_once_and_keeps_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def begin(wanted: precision.Precision = "auto") -> runs.Run:
+        arguments = Arguments("maze2d", accelerator="cpu", precision=wanted)
+        return runs.Run(tmp_path, "train_local", arguments, epochs=2)
+
+    monkeypatch.setattr(precision, "cpu_gain", lambda: 0.5)
+    run = begin()
+    assert run.record["arguments"]["precision"] == "32-true" and run.trainer.precision == "32-true"
+    assert "--precision 32-true" in run.record["command"]
+    assert capsys.readouterr().out.splitlines() == [
+        "precision 32-true: on this CPU bfloat16 has 0.50 times the speed of float32 (--precision chooses another)"
+    ]
+    run.finish({})
+    (tmp_path / "last.ckpt").touch()
+    monkeypatch.setattr(precision, "cpu_gain", lambda: 2.0)
+    assert begin().record["arguments"]["precision"] == "32-true"
+    assert json.loads((tmp_path / "run.json").read_text())["arguments"]["precision"] == "32-true"
+    with pytest.raises(records.RunError, match="given precision bf16-mixed; expected precision 32-true"):
+        begin("bf16-mixed")

@@ -1,10 +1,15 @@
-"""Simulated scanners: what is drawn follows from the seed, and noise, dropouts and limits are those that were drawn."""
+"""Simulated drives and scanners of the lidar's tables."""
 
 import numpy as np
 import pytest
 
+from ngo_estimator.data.images import scan_image
 from ngo_sim.episodes import Episode, record_episode
-from training.data.scans import SCAN_IMAGE, ScannedMaze, Scanner
+from training.data.building_drives import building_drive
+from training.data.lidar_drives import TruePoses
+from training.data.scans import ROWS, SCAN_IMAGE, ScannedMaze, Scanner
+from training.data.simulated_drives import maze_drive, scanned_maze_drive
+from training.data.worlds import WORLDS
 
 SIZE = {"rows": 3, "cols": 3}
 PERFECT = {"every": 1, "first": 0, "field_of_view_deg": 360.0, "noise_m": 0.0, "dropout": 0.0, "range_max_m": 100.0}
@@ -49,3 +54,39 @@ def test_what_is_drawn_is_in_its_ranges_and_varies() -> None:
     assert {s.every for s in scanners} == {1, 2, 3, 4} and all(s.first < s.every for s in scanners)
     widths = [episode(seed, 1).maze.block_m for seed in range(20)]
     assert 0.8 <= min(widths) < 1.1 and 1.9 < max(widths) <= 2.5
+
+
+def test_a_building_is_the_same_each_time_and_another_where_rooms_repeat() -> None:
+    first, again = (building_drive(20_003, 3.0) for _ in range(2))
+    aliased = building_drive(20_003, 3.0, aliased=True)
+    assert len(first.scans) == len(first.wheels) > 10
+    assert isinstance(first.reference, TruePoses)
+    assert all(np.array_equal(a.ranges, b.ranges) for a, b in zip(first.scans, again.scans, strict=True))
+    assert not np.array_equal(first.scans[0].ranges, aliased.scans[0].ranges)
+    assert first.reference.stamps_ns.tolist() == [scan.stamp_ns for scan in first.scans]
+    assert first.identity != aliased.identity
+
+
+def test_a_scanned_maze_has_the_scans_that_the_networks_saw() -> None:
+    frames = 5
+    drive = scanned_maze_drive(1_500, frames, {})
+    rng = np.random.default_rng(1_500)
+    rows = int(rng.integers(ROWS[0], ROWS[1] + 1))
+    size = {"rows": rows, "cols": rows, "extra_openings": int(rng.integers(0, 9))}
+    episode = record_episode(ScannedMaze(SCAN_IMAGE, size, {}), WORLDS["maze2d"].driver, frames, 1_500)
+    images = [
+        scan_image(SCAN_IMAGE, scan.ranges, scan.angle_min, scan.angle_increment, 0.0, np.inf).reshape(-1)
+        for scan in drive.scans
+    ]
+    np.testing.assert_allclose(images, episode.observations, atol=1e-6)
+    assert isinstance(drive.reference, TruePoses)
+    assert np.array_equal(drive.reference.poses_xyyaw, episode.poses_xyyaw)
+
+
+def test_a_maze_is_seen_from_left_to_right() -> None:
+    drive = maze_drive(1_500, 4)
+    scan = drive.scans[0]
+    assert (len(scan.ranges), drive.wheels) == (241, ())
+    np.testing.assert_allclose(
+        np.degrees((scan.angle_min, scan.angle_min + 240 * scan.angle_increment)), (150.0, -150.0), atol=1e-6
+    )

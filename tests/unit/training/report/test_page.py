@@ -1,15 +1,18 @@
-"""Pages are made of their JSON alone: those in ``docs/`` are what today's templates make of the stored numbers."""
+"""Pages and folders of results."""
 
 import json
 import re
 from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import pytest
 
-from training.common.records import ROOT, WEIGHTS
+from training.common.records import ROOT, WEIGHTS, record
 from training.data.worlds import world_named
 from training.report import doom_page, faults_page, lidar_page, map_page, relocalisation_page, results_page
+from training.report.folders import Folders
 from training.report.page import Column, number, short, table
 
 Page = Callable[[dict[str, Any], dict[str, str]], str]
@@ -63,3 +66,17 @@ def test_a_table_has_a_line_a_row_and_an_empty_cell_for_no_number() -> None:
 )
 def test_numbers_have_three_digits(value: float, text: str) -> None:
     assert number(value) == text
+
+
+@dataclass(frozen=True)
+class Arguments(Folders):
+    drives: int = 3  # Drives.
+
+
+def test_json_and_page_lie_in_the_folders_for_them_and_no_folder_is_recorded(tmp_path: Path) -> None:
+    arguments = Arguments(drives=4, out=tmp_path / "out", docs=tmp_path / "docs")
+    assert arguments.publish("rooms", {"a": [1, 2]}, "# Rooms\n") == {"a": [1, 2]}
+    assert json.loads((tmp_path / "out" / "rooms.json").read_text()) == {"a": [1, 2]}
+    assert (tmp_path / "docs" / "results_rooms.md").read_text() == "# Rooms\n"
+    assert arguments.images == tmp_path / "docs" / "images"
+    assert record("rooms", arguments)["command"] == "python -m training.rooms --drives 4"
