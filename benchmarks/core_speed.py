@@ -13,16 +13,18 @@ import torch
 from tqdm import tqdm
 
 from benchmarks.drives import CACHE, Drive, drive_of, episodes, stamp_ns
-from benchmarks.peers import INCREMENTAL, SETTINGS, Incremental, LevenbergMarquardt, Problem, xyyaw
+from benchmarks.peers import INCREMENTAL, SETTINGS, Incremental, LevenbergMarquardt, Problem
 from ngo_estimator.checkpoint import load_optimizer, load_place
 from ngo_estimator.frontend.camera.local_odometry import LocalOdometry
 from ngo_estimator.loops.loop_closure import Loops
 from ngo_estimator.ngo.meta_poses import MetaSteps
 from ngo_estimator.nodes.path_message import PathWriter
 from ngo_estimator.slam.online_trajectory import OnlineTrajectory
+from training.baselines.pose_graph import xyyaw
 from training.common.records import WEIGHTS
 from training.data.episodes import images_of
 from training.data.worlds import world_named
+from training.scoring.metrics import position_rmse_m
 
 Result = TypeVar("Result")
 
@@ -162,5 +164,4 @@ def local_core_ms(world_name: str, seed: int, frames: int) -> list[float]:
 
 def rmse_m(nodes: np.ndarray, drive: Drive, block: int) -> float:
     """Error of the positions ``(blocks, 3)`` after each meta-pose."""
-    error = nodes[:, :2] - drive.truth[block - 1 : len(nodes) * block : block, :2]
-    return float(np.sqrt((error**2).sum(axis=1).mean()))
+    return position_rmse_m(nodes, drive.truth[block - 1 : len(nodes) * block : block])

@@ -46,6 +46,7 @@ from training.common.records import ROOT, WEIGHTS
 from training.data.batches import seen_from_first
 from training.data.building_drives import building_drive
 from training.data.lidar_drives import LidarDrive, TruePoses
+from training.scoring.metrics import position_rmse_m
 
 LONGEST_RATIO, MOST_GROWTH_MB = 1.2, 100.0
 _FAR_M = 100_000.0
@@ -139,9 +140,9 @@ def points(arguments: Arguments) -> list[Point]:
             memory_mb=resident_mb,
             stored_path_mb=stored_mb,
             path_ms=path_ms,
-            odometry_rmse_m=_rmse_m(trajectory.odometry_xyyaw, so_far),
-            online_rmse_m=_rmse_m(trajectory.online_xyyaw, so_far),
-            optimised_rmse_m=_rmse_m(trajectory.poses_xyyaw, so_far),
+            odometry_rmse_m=position_rmse_m(trajectory.odometry_xyyaw, so_far),
+            online_rmse_m=position_rmse_m(trajectory.online_xyyaw, so_far),
+            optimised_rmse_m=position_rmse_m(trajectory.poses_xyyaw, so_far),
         )
         found.append(point)
         if len(found) % 5 == 0:
@@ -260,10 +261,6 @@ def save_plot(path: Path, found: list[Point], title: str) -> None:
     below.yaxis.set_minor_formatter(NullFormatter())
     path.parent.mkdir(parents=True, exist_ok=True)
     figure.savefig(path, dpi=110, bbox_inches="tight")
-
-
-def _rmse_m(estimate: np.ndarray, truth: np.ndarray) -> float:
-    return float(np.sqrt(((estimate[:, :2] - truth[:, :2]) ** 2).sum(axis=1).mean()))
 
 
 def main(arguments: Arguments) -> int:

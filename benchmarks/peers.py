@@ -12,7 +12,7 @@ import torch
 from ngo_estimator.geometry import se2
 from ngo_estimator.loops.loop_closure import Loops
 from ngo_estimator.ngo.meta_poses import MetaSteps
-from training.baselines.pose_graph import PoseGraphSettings
+from training.baselines.pose_graph import PoseGraphSettings, xyyaw
 
 SETTINGS = PoseGraphSettings()
 """How far odometry and loops are believed, and the robust kernel: those of the classical baseline."""
@@ -132,11 +132,6 @@ class Incremental:
     def keep(self, estimate: gtsam.Values) -> None:
         """Let the next meta-pose begin where this solution ends."""
         self._last = xyyaw(estimate)[-1]
-
-
-def xyyaw(values: gtsam.Values) -> np.ndarray:
-    """Poses ``(nodes, 3)`` in the order of the nodes."""
-    return np.asarray(gtsam.utilities.extractPose2(values))
 
 
 def _from_origin(relative: np.ndarray) -> np.ndarray:

@@ -137,7 +137,7 @@ class _Graph:
 
     def solve(self) -> np.ndarray:
         """Poses ``(blocks + 1, 3)`` from odometry and loops."""
-        return _xyyaw(self._loop_closed())
+        return xyyaw(self._loop_closed())
 
     def _loop_closed(self) -> gtsam.Values:
         values = gtsam.Values()
@@ -186,6 +186,6 @@ def _minimum(graph: gtsam.NonlinearFactorGraph, start: gtsam.Values) -> gtsam.Va
     return gtsam.LevenbergMarquardtOptimizer(graph, start, parameters).optimize()
 
 
-def _xyyaw(values: gtsam.Values) -> np.ndarray:
+def xyyaw(values: gtsam.Values) -> np.ndarray:
     """Poses ``(nodes, 3)`` in the order of the nodes."""
     return np.asarray(gtsam.utilities.extractPose2(values))

@@ -10,7 +10,7 @@ from ngo_estimator.frontend.camera.local_odometry import LocalEstimate, LocalOdo
 from ngo_estimator.slam.online_trajectory import OnlineTrajectory
 from training.data.batches import seen_from_first
 from training.data.faults import SensedDrive
-from training.scoring.metrics import within
+from training.scoring.metrics import position_rmse_m, within
 from training.scoring.online_estimate import carried_covariances, online_run
 
 _STAMP_NS = 1_000_000_000
@@ -58,8 +58,8 @@ def honest_run(local: LocalOdometry, online: OnlineTrajectory, drive: SensedDriv
     odometry = np.stack([step.odom_xyyaw for step in steps])
     of_odometry = odometry_covariances(odometry, steps)
     return HonestRun(
-        rmse_m(odometry, truth),
-        rmse_m(run.trajectory.poses_xyyaw[1:], truth),
+        position_rmse_m(odometry, truth),
+        position_rmse_m(run.trajectory.poses_xyyaw[1:], truth),
         within(odometry, of_odometry, truth),
         within(run.published, run.covariances, truth),
         _median_deviation(run.covariances),
@@ -73,11 +73,6 @@ def odometry_covariances(odometry: np.ndarray, steps: list[LocalEstimate]) -> np
     """Covariances ``(n, 3, 3)`` of the poses in ``odom``, as ``local_node`` publishes them."""
     relative, covariances = ([getattr(step, name) for step in steps] for name in ("relative_xyyaw", "covariance"))
     return carried_covariances(odometry, np.stack(relative), np.stack(covariances))
-
-
-def rmse_m(poses: np.ndarray, truth: np.ndarray) -> float:
-    """Root mean square error of positions."""
-    return float(np.sqrt(np.square(poses[:, :2] - truth[:, :2]).sum(axis=1).mean()))
 
 
 def _median_deviation(covariances: np.ndarray) -> float:

@@ -71,6 +71,11 @@ def absolute_error_m(estimate_xyyaw: np.ndarray, reference_xyyaw: np.ndarray) ->
     return float(np.sqrt(((turned - reference) ** 2).sum(axis=1).mean()))
 
 
+def position_rmse_m(poses: np.ndarray, truth: np.ndarray) -> float:
+    """Root mean square distance of positions, of poses ``(n, 3)`` of one frame."""
+    return float(np.sqrt(np.square(poses[:, :2] - truth[:, :2]).sum(axis=1).mean()))
+
+
 def rms(values: np.ndarray) -> float:
     """Root mean square."""
     return float(np.sqrt(np.square(values).mean()))

@@ -12,7 +12,7 @@ from benchmarks.core_speed import Watched, core_speed
 from benchmarks.drives import Drive, drive_of, episodes, stamp_ns
 from benchmarks.lidar_live import RATE_HZ, Arguments, frames_of
 from benchmarks.long_run import stored_path_mb
-from benchmarks.peers import Incremental, LevenbergMarquardt, Problem, xyyaw
+from benchmarks.peers import Incremental, LevenbergMarquardt, Problem
 from benchmarks.process_use import cpu_s, memory_mb
 from ngo_estimator.data.row_buffers import GrowingRows
 from ngo_estimator.geometry import se2
@@ -22,6 +22,7 @@ from ngo_estimator.slam.online_trajectory import OnlineTrajectory
 from ngo_sim.episodes import record_episode
 from tests.unit.ngo_estimator.slam.test_online_trajectory import make_steps
 from tests.unit.ngo_estimator.slam.test_saved_state import lidar_drive, networks, scans
+from training.baselines.pose_graph import xyyaw
 from training.common.records import WEIGHTS
 from training.data.worlds import world_named
 
