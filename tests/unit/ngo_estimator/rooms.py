@@ -10,6 +10,7 @@ from torch import Tensor
 from ngo_estimator.geometry import se2
 from ngo_estimator.geometry.scan_registration import RegistrationConfig
 from ngo_estimator.networks.place_encoder import PairHead
+from tests.unit.ngo_estimator.ray_casting import cast, fan, walls
 from tests.unit.ngo_estimator.samples import place_config
 
 RAYS = 241
@@ -17,29 +18,16 @@ CONFIG = RegistrationConfig(RAYS, 300.0, 0.001)
 # As a camera sees: much less than all around.
 CAMERA = dataclasses.replace(CONFIG, rays=81, field_of_view_deg=106.0, odometry=False)
 # An L-shaped room with a pillar: no two places in it look alike.
-_CORNERS = (
+_ROOM = walls(
     ((0.0, 0.0), (6.0, 0.0), (6.0, 2.5), (3.0, 2.5), (3.0, 5.0), (0.0, 5.0)),
     ((1.2, 3.2), (1.5, 3.2), (1.5, 3.6), (1.2, 3.6)),
 )
 
 
 def ranges_at(poses: Tensor, rays: int = RAYS, field_of_view_deg: float = 300.0) -> Tensor:
-    """Exact ranges ``(n, rays)``, float64, of scans taken at poses ``(n, 3)`` in the room."""
-    corners = [np.array(part) for part in _CORNERS]
-    start = torch.tensor(np.concatenate(corners))
-    end = torch.tensor(np.concatenate([np.roll(part, -1, axis=0) for part in corners]))
-    half = math.radians(field_of_view_deg) / 2.0
-    angle = poses[:, 2:] + torch.linspace(half, -half, rays, dtype=torch.float64)
-    direction = torch.stack((angle.cos(), angle.sin()), dim=-1).unsqueeze(-2)
-    along, to_start = end - start, start - poses[:, None, None, :2]
-    determinant = _cross(direction, along)
-    distance, share = _cross(to_start, along) / determinant, _cross(to_start, direction) / determinant
-    hit = (distance > 0.0) & (share >= 0.0) & (share <= 1.0)
-    return torch.where(hit, distance, math.inf).amin(-1)
-
-
-def _cross(a: Tensor, b: Tensor) -> Tensor:
-    return a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0]
+    """Exact ranges ``(n, rays)``, float64, of scans taken at poses ``(n, 3)`` in the room, the leftmost ray first."""
+    angles = fan(rays, field_of_view_deg)[::-1]
+    return torch.from_numpy(np.stack([cast(_ROOM, pose, angles) for pose in poses.numpy()]))
 
 
 def round_trip(steps: int, period: int = 64) -> Tensor:
