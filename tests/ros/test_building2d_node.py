@@ -1,9 +1,5 @@
 """The node of the building as a real process over DDS."""
 
-import math
-from collections.abc import Iterator
-from typing import Any
-
 import numpy as np
 import pytest
 from nav_msgs.msg import Odometry
@@ -18,6 +14,7 @@ from ngo_sim.lidar import ScannerConfig
 from ngo_sim.wheels import WheelsConfig
 
 from .processes import NodeProcess, Probe
+from .readings import stamps_ns, xyyaw
 
 pytestmark = pytest.mark.processes
 
@@ -25,21 +22,6 @@ FRAMES = 30
 PLAN = {"scale": 0.5, "layout": "ring"}
 SCANNER = {"rays": 90, "laser_x_m": 0.1, "laser_yaw_deg": 90.0, "upside_down": True, "sweep": 0.5}
 WHEELS = {"lag_s": 0.15, "left_bias": 0.02}
-
-
-@pytest.fixture
-def probe() -> Iterator[Probe]:
-    with Probe() as probe:
-        yield probe
-
-
-def stamps_ns(messages: list[Any]) -> list[int]:
-    return [message.header.stamp.sec * 10**9 + message.header.stamp.nanosec for message in messages]
-
-
-def xyyaw(message: Odometry) -> tuple[float, float, float]:
-    pose = message.pose.pose
-    return pose.position.x, pose.position.y, 2 * math.atan2(pose.orientation.z, pose.orientation.w)
 
 
 def test_it_publishes_what_the_core_gives(probe: Probe) -> None:

@@ -1,7 +1,5 @@
 """Simulated robots that are driven by `cmd_vel` over DDS."""
 
-from collections.abc import Iterator
-
 import pytest
 from geometry_msgs.msg import PointStamped, Twist, Vector3
 from nav_msgs.msg import Odometry
@@ -9,12 +7,6 @@ from nav_msgs.msg import Odometry
 from .processes import NodeProcess, Probe
 
 pytestmark = pytest.mark.processes
-
-
-@pytest.fixture
-def probe() -> Iterator[Probe]:
-    with Probe() as probe:
-        yield probe
 
 
 @pytest.mark.parametrize(

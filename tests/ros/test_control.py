@@ -26,6 +26,7 @@ from ngo_estimator.slam.tf_smoothing import SmoothedCorrection
 from ngo_estimator.trajectory.g2o import PlanarGraph, read_g2o
 
 from .processes import NodeProcess, Probe
+from .readings import xyyaw
 from .relative_poses import Optimizer, assert_pose_is
 
 pytestmark = pytest.mark.processes
@@ -44,13 +45,6 @@ def optimizer(weights: Path, parameters: dict[str, Any]) -> Iterator[Optimizer]:
         process.send(signal.SIGINT)
         assert process.wait() == 0, process.log
         assert "Traceback" not in process.log, process.log
-
-
-def xyyaw(pose: Any) -> np.ndarray:
-    """The planar pose of a Pose or a Transform."""
-    where = getattr(pose, "position", None) or pose.translation
-    turned = getattr(pose, "orientation", None) or pose.rotation
-    return np.array([where.x, where.y, 2.0 * np.arctan2(turned.z, turned.w)])
 
 
 # ---- services

@@ -3,7 +3,6 @@
 import math
 import os
 import signal
-from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -16,21 +15,12 @@ from ngo_sim.doom_engine import SHIPPED
 from ngo_sim.doom_wad import find_wad, read_wad, write_lumps
 
 from .processes import NodeProcess, Probe
+from .readings import stamps_ns
 
 pytestmark = pytest.mark.processes
 
 FRAMES = 120
 SCENARIO = {"wad": "my_way_home.wad", "map": "map01"}
-
-
-@pytest.fixture
-def probe() -> Iterator[Probe]:
-    with Probe() as probe:
-        yield probe
-
-
-def stamps(messages: list[Image] | list[Odometry] | list[PoseWithCovarianceStamped]) -> list[int]:
-    return [message.header.stamp.sec * 10**9 + message.header.stamp.nanosec for message in messages]
 
 
 def test_the_estimators_run_unchanged_on_a_scenario_that_vizdoom_ships(probe: Probe) -> None:
@@ -57,7 +47,7 @@ def test_the_estimators_run_unchanged_on_a_scenario_that_vizdoom_ships(probe: Pr
             probe.spin_until(lambda: not simulator.running, "the simulator's end")
             assert simulator.wait() == 0, simulator.log
     # A relative pose leads to each frame but the first.
-    assert stamps(corrected) == stamps(odometry) == stamps(images)[1:]
+    assert stamps_ns(corrected) == stamps_ns(odometry) == stamps_ns(images)[1:]
     true = np.array([(m.pose.pose.position.x, m.pose.pose.position.y) for m in truth])
     found = np.array([(m.pose.pose.position.x, m.pose.pose.position.y) for m in corrected])
     true_m, found_m = (float(np.linalg.norm(np.diff(path, axis=0), axis=1).sum()) for path in (true, found))

@@ -1,7 +1,6 @@
 """Both estimators as real processes on a lidar's scans: its mounting and the robot's own odometry come from topics."""
 
 import math
-from collections.abc import Iterator
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -28,6 +27,7 @@ from ngo_recordings.transform_buffer import TransformBuffer
 from tests.unit.ngo_estimator.ray_casting import ROOM, cast
 
 from .processes import NodeProcess, Probe
+from .readings import xyyaw
 
 pytestmark = pytest.mark.processes
 
@@ -113,18 +113,6 @@ class Outputs:
         stamped = (self.relative_poses, self.odometry, self.poses)
         later = ([m for m in messages if to_ns(m.header.stamp) >= stamp_ns] for messages in stamped)
         return Outputs(*later, [m for m in self.transforms if to_ns(m.transforms[0].header.stamp) >= stamp_ns])
-
-
-@pytest.fixture
-def probe() -> Iterator[Probe]:
-    with Probe() as probe:
-        yield probe
-
-
-def xyyaw(pose: Any) -> np.ndarray:
-    position = getattr(pose, "position", None) or pose.translation
-    rotation = getattr(pose, "orientation", None) or pose.rotation
-    return np.array([position.x, position.y, 2.0 * math.atan2(rotation.z, rotation.w)])
 
 
 def close(a: np.ndarray, b: np.ndarray, metres: float, degrees: float) -> bool:

@@ -22,6 +22,7 @@ from ngo_estimator.nodes.messages import pose_message, relative_pose_message, to
 from tests.golden.drives import WEIGHTS, GoldenDrive, estimates
 
 from .processes import NodeProcess, Probe
+from .readings import xyyaw
 from .relative_poses import Optimizer
 
 pytestmark = pytest.mark.processes
@@ -77,7 +78,7 @@ def mapped(tmp_path_factory: pytest.TempPathFactory) -> Mapped:
         for step in steps[START:]
     ]
     messages = [relative_pose_message(step, "base_link") for step in later]
-    return Mapped(parameters, len(steps) + 1, messages, _planar(last), later[-1].odom_xyyaw)
+    return Mapped(parameters, len(steps) + 1, messages, xyyaw(last), later[-1].odom_xyyaw)
 
 
 @pytest.fixture(scope="module")
@@ -91,11 +92,6 @@ def again(mapped: Mapped) -> Iterator[Again]:
             process.send(signal.SIGINT)
             assert process.wait() == 0, process.log
             assert "Traceback" not in process.log, process.log
-
-
-def _planar(message: PoseWithCovarianceStamped) -> np.ndarray:
-    pose = message.pose.pose
-    return np.array((pose.position.x, pose.position.y, 2.0 * np.arctan2(pose.orientation.z, pose.orientation.w)))
 
 
 def test_another_start_is_found_in_the_loaded_map_which_then_grows(mapped: Mapped) -> None:
@@ -113,7 +109,7 @@ def test_another_start_is_found_in_the_loaded_map_which_then_grows(mapped: Mappe
         node.wait_for_problem("not localised: ", "support")
         assert not transforms and not node.poses
         node.publish(*later[3:])
-        assert _planar(node.wait_for_stamp(_stamp_ns(later[-1]))) == pytest.approx(mapped.expected, abs=0.03)
+        assert xyyaw(node.wait_for_stamp(_stamp_ns(later[-1]))) == pytest.approx(mapped.expected, abs=0.03)
         process.wait_for_log("localised: several frames agree")
         process.wait_for_log("the loaded map grows from here")
         both = frames + len(node.poses)
@@ -128,7 +124,7 @@ def test_another_start_is_found_in_the_loaded_map_which_then_grows(mapped: Mappe
         # Another odometry does not wipe the map: the robot is looked for in it again.
         third, known = [_later(message, 2) for message in mapped.steps], len(node.poses)
         node.publish(*third)
-        assert _planar(node.wait_for_stamp(_stamp_ns(third[-1]))) == pytest.approx(mapped.expected, abs=0.03)
+        assert xyyaw(node.wait_for_stamp(_stamp_ns(third[-1]))) == pytest.approx(mapped.expected, abs=0.03)
         process.wait_for_log("looks for the robot in the map, which stays")
         whole = both + len(node.poses) - known
         assert node.wait_for_value("frames", lambda value: value == str(whole))
@@ -139,7 +135,7 @@ def test_another_start_is_found_in_the_loaded_map_which_then_grows(mapped: Mappe
         node.wait_for_problem("not localised: no hypothesis yet")
         assert probe.call(Reset, "ngo_node/reset", Reset.Request()).message == f"forgot {frames} poses"
         node.publish(later[0])
-        assert np.hypot(*_planar(node.wait_for_stamp(_stamp_ns(later[0])))[:2]) < 0.5
+        assert np.hypot(*xyyaw(node.wait_for_stamp(_stamp_ns(later[0])))[:2]) < 0.5
         process.send(signal.SIGINT)
         assert process.wait() == 0, process.log
         assert "Traceback" not in process.log, process.log
@@ -151,7 +147,7 @@ def test_a_map_that_learns_grows_from_where_the_robot_is_and_outlives_a_reset(ma
     with Probe() as probe, NodeProcess("ngo_estimator", "ngo_node", parameters) as process:
         node = Node(process, WEIGHTS / "maze2d", probe)
         node.publish(*again)
-        assert _planar(node.wait_for_stamp(_stamp_ns(again[-1]))) == pytest.approx(mapped.expected, abs=0.03)
+        assert xyyaw(node.wait_for_stamp(_stamp_ns(again[-1]))) == pytest.approx(mapped.expected, abs=0.03)
         process.wait_for_log("the loaded map grows from here")
         frames = mapped.frames + len(node.poses)
         response = probe.call(SaveState, "ngo_node/save_state", SaveState.Request(path="learnt"))
@@ -160,7 +156,7 @@ def test_a_map_that_learns_grows_from_where_the_robot_is_and_outlives_a_reset(ma
         node.wait_for_problem("not localised")
         known = len(node.poses)
         node.publish(*third)
-        assert _planar(node.wait_for_stamp(_stamp_ns(third[-1]))) == pytest.approx(mapped.expected, abs=0.03)
+        assert xyyaw(node.wait_for_stamp(_stamp_ns(third[-1]))) == pytest.approx(mapped.expected, abs=0.03)
         node.wait_for_value("frames", str(frames + len(node.poses) - known).__eq__)
         publisher = probe.node.create_publisher(PoseWithCovarianceStamped, "initialpose", 10)
         probe.spin_until(lambda: publisher.get_subscription_count() == 1, "ngo_node's subscription of initialpose")
@@ -169,7 +165,7 @@ def test_a_map_that_learns_grows_from_where_the_robot_is_and_outlives_a_reset(ma
         process.wait_for_log("the robot is at x 1.000 m, y 2.000 m, yaw 0.500 rad, as it was told")
         fourth = _later(mapped.steps[0], 5)
         node.publish(fourth)
-        assert np.hypot(*(_planar(node.wait_for_stamp(_stamp_ns(fourth))) - given)[:2]) < 0.5
+        assert np.hypot(*(xyyaw(node.wait_for_stamp(_stamp_ns(fourth))) - given)[:2]) < 0.5
         process.send(signal.SIGINT)
         assert process.wait() == 0, process.log
         assert "Traceback" not in process.log, process.log
@@ -184,14 +180,12 @@ def test_a_robot_says_that_it_is_not_localised_until_its_pose_is_known_and_right
     assert not again.transforms and not node.poses
     node.publish(*again.steps[3:])
     last = node.wait_for_stamp(_stamp_ns(again.steps[-1]))
-    assert _planar(last) == pytest.approx(again.expected, abs=0.03)
+    assert xyyaw(last) == pytest.approx(again.expected, abs=0.03)
     again.process.wait_for_log("localised: several frames agree")
     again.probe.spin_until(lambda: len(again.transforms) == len(node.poses), "a transform for each pose")
     (transform,) = again.transforms[-1].transforms
     assert (transform.header.frame_id, transform.child_frame_id) == ("map", "odom")
-    rotation, translation = transform.transform.rotation, transform.transform.translation
-    map_from_odom = np.array((translation.x, translation.y, 2.0 * np.arctan2(rotation.z, rotation.w)))
-    assert compose(map_from_odom, again.odom) == pytest.approx(again.expected, abs=0.03)
+    assert compose(xyyaw(transform.transform), again.odom) == pytest.approx(again.expected, abs=0.03)
     assert node.wait_for_value("localisation", lambda value: value == "localised")
 
 
@@ -210,7 +204,7 @@ def test_a_reset_forgets_the_pose_and_initialpose_gives_it(again: Again) -> None
     publisher.publish(pose_message(1, "map", given, np.diag((0.1, 0.1, 0.05))))
     again.process.wait_for_log("the robot is at x 1.000 m, y 2.000 m, yaw 0.500 rad, as it was told")
     node.publish(again.steps[2])
-    assert np.hypot(*(_planar(node.wait_for_stamp(_stamp_ns(again.steps[2]))) - given)[:2]) < 0.5
+    assert np.hypot(*(xyyaw(node.wait_for_stamp(_stamp_ns(again.steps[2]))) - given)[:2]) < 0.5
 
 
 def _later(message: RelativePose, hours: int = 1) -> RelativePose:

@@ -22,6 +22,7 @@ from ngo_estimator.nodes.messages import to_ns, to_time
 from tests.unit.ngo_estimator.samples import SCAN
 
 from .processes import NodeProcess, Probe
+from .readings import xyyaw
 
 pytestmark = pytest.mark.processes
 
@@ -149,15 +150,10 @@ def test_the_shipped_lidar_follows_the_simulator(probe: Probe) -> None:
         assert "dropped" not in local.log + ngo.log, local.log + ngo.log
     driven = np.array([[m.pose.pose.position.x, m.pose.pose.position.y] for m in truth])
     length_m = np.linalg.norm(np.diff(driven, axis=0), axis=1).sum()
-    start, end = (seen_as_planar(message) for message in (truth[0], truth[-1]))
+    start, end = (xyyaw(message) for message in (truth[0], truth[-1]))
     moved = se2.between(torch.from_numpy(start), torch.from_numpy(end)).numpy()
     assert length_m > 10.0 and np.linalg.norm(moved[:2]) > 1.0
     for estimate in (odometry[-1], poses[-1]):
-        error = seen_as_planar(estimate) - moved
+        error = xyyaw(estimate) - moved
         assert np.linalg.norm(error[:2]) < 0.03 * length_m, error
         assert abs(np.remainder(error[2] + np.pi, 2.0 * np.pi) - np.pi) < np.radians(6.0), error
-
-
-def seen_as_planar(message: Odometry | PoseWithCovarianceStamped) -> np.ndarray:
-    pose = message.pose.pose
-    return np.array([pose.position.x, pose.position.y, 2.0 * np.arctan2(pose.orientation.z, pose.orientation.w)])

@@ -3,14 +3,12 @@
 import math
 import signal
 import time
-from collections.abc import Iterator
 from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-from builtin_interfaces.msg import Time
 from nav_msgs.msg import Odometry
 from ngo_msgs.msg import DiscreteAction
 from rcl_interfaces.srv import DescribeParameters, SetParameters
@@ -20,11 +18,13 @@ from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import CameraInfo, Image, LaserScan
 from tf2_msgs.msg import TFMessage
 
+from ngo_estimator.nodes.messages import to_ns
 from ngo_sim.episodes import Episode, record_episode
 from ngo_sim.maze2d import Maze2D
 from ngo_sim.maze3d import Maze3D
 
 from .processes import NodeProcess, Probe, wait_until
+from .readings import stamps_ns, xyyaw
 
 pytestmark = pytest.mark.processes
 
@@ -32,28 +32,8 @@ SEED = 7
 FRAMES = 25
 
 
-@pytest.fixture
-def probe() -> Iterator[Probe]:
-    with Probe() as probe:
-        yield probe
-
-
 def simulator(world: str, *ros_arguments: str, **parameters: Any) -> NodeProcess:
     return NodeProcess("ngo_sim", world, parameters, ros_arguments)
-
-
-def stamp_ns(message: Any) -> int:
-    stamp: Time = message if isinstance(message, Time) else message.header.stamp
-    return stamp.sec * 10**9 + stamp.nanosec
-
-
-def stamps(messages: list[Any]) -> list[int]:
-    return [stamp_ns(message) for message in messages]
-
-
-def xyyaw(message: Odometry) -> tuple[float, float, float]:
-    pose = message.pose.pose
-    return pose.position.x, pose.position.y, 2 * math.atan2(pose.orientation.z, pose.orientation.w)
 
 
 def pixels(messages: list[Image], dtype: type, *shape: int) -> np.ndarray:
@@ -82,9 +62,9 @@ class Run:
     def check(self, episode: Episode, period_s: float) -> None:
         """Compare with what the core records without ROS."""
         expected = [10**9 + round(frame * period_s * 1e9) for frame in range(FRAMES)]
-        assert stamps(self.images) == stamps(self.truth) == stamps(self.sensor) == expected
-        assert stamps(self.actions) == expected[:-1]
-        assert [stamp_ns(message.clock) for message in self.clock] == expected
+        assert stamps_ns(self.images) == stamps_ns(self.truth) == stamps_ns(self.sensor) == expected
+        assert stamps_ns(self.actions) == expected[:-1]
+        assert [to_ns(message.clock) for message in self.clock] == expected
         assert [message.action for message in self.actions] == episode.actions.tolist()
         np.testing.assert_allclose([xyyaw(message) for message in self.truth], episode.poses_xyyaw, atol=1e-12)
         speeds = [math.hypot(m.twist.twist.linear.x, m.twist.twist.linear.y) for m in self.truth]
@@ -162,7 +142,7 @@ def test_none_is_lost_by_a_slow_subscriber(probe: Probe) -> None:
             due = min(answered + 1 + in_flight, FRAMES)
             probe.spin_until(lambda due=due: len(images) >= due, f"frame {due}")
         assert node.wait() == 0, node.log
-    assert stamps(images) == [10**9 + 10**8 * frame for frame in range(FRAMES)]
+    assert stamps_ns(images) == [10**9 + 10**8 * frame for frame in range(FRAMES)]
 
 
 def test_without_a_driver_each_command_is_one_step(probe: Probe) -> None:
@@ -244,7 +224,7 @@ def test_a_start_is_told_in_one_line_and_a_signal_ends_it(probe: Probe) -> None:
             "ready: /red/maze2d, seed 3, 100 frames a second, publishes /red/action, /red/camera, /red/ground_truth, "
             "/red/scan; waits for 1 subscribers of the image"
         )
-        received = stamps(images)
+        received = stamps_ns(images)
         assert before < received[0] and received == sorted(set(received)) and received[-1] < time.time_ns()
         node.send(signal.SIGTERM)
         assert node.wait() == 0, node.log
