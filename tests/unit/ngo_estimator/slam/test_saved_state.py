@@ -178,18 +178,6 @@ def test_the_round_trip_of_a_lidar_is_exact(tmp_path: Path, when: str, monkeypat
     assert_same(original, loaded)
 
 
-def test_what_goes_on_after_saving_leaves_the_saved_arrays_as_they_are(tmp_path: Path) -> None:
-    core, steps = networks(), make_steps(64)
-    drive(core, steps[:40], range(0))
-    arrays = core.state()
-    before = {name: array.copy() for name, array in arrays.items()}
-    loaded = networks().restored(arrays)
-    drive(core, steps[40:], range(0)), drive(loaded, steps[40:], range(0))
-    for name, array in before.items():
-        np.testing.assert_array_equal(arrays[name], array, err_msg=name)
-    assert_same(core, loaded)
-
-
 def test_an_array_in_another_order_of_memory_is_read_as_it_was(tmp_path: Path) -> None:
     array = np.asfortranarray(np.arange(6.0).reshape(3, 2))
     write_state(tmp_path / "state", {}, {"rows": array, "count": np.array(3)})

@@ -124,22 +124,6 @@ def test_a_steps_covariance_is_kept_along_its_own_axes() -> None:
     assert update.covariance[0, 0] > 50.0 * update.covariance[1, 1]
 
 
-def test_frames_between_two_nodes_take_their_share_of_the_correction() -> None:
-    true, _, steps = loop_drive()
-    trajectory = ScanTrajectory()
-    for step in steps:
-        trajectory.update(step)
-    trajectory.finish()
-    whole = trajectory.trajectory()
-    assert whole is not None
-    moved = np.array([between(a, b) for a, b in zip(whole.poses_xyyaw[:-1], whole.poses_xyyaw[1:], strict=True)])
-    given = np.array([step.relative_xyyaw for step in steps])
-    # No step jumps where the nodes are: each is near its odometry.
-    assert np.abs(moved - given).max() < 0.03
-    assert len(whole.moved_m) == len(whole.poses_xyyaw) == len(whole.stamps_ns) == len(whole.odometry_std) + 1
-    assert errors(trajectory, true).max() < 0.3
-
-
 @pytest.mark.parametrize("lost", [range(20, 26), range(60, 61), range(3, 150)])
 def test_lost_relative_poses_and_key_scans_are_bridged(lost: range) -> None:
     _, odometry, steps = loop_drive()
