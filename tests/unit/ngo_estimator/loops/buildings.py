@@ -17,8 +17,8 @@ MOUNTING = Mounting(np.zeros(3))
 
 
 def outline(*corners: tuple[float, float]) -> np.ndarray:
-    """Walls ``(n, 2, 2)`` from corner to corner, closed."""
-    return walls(corners)
+    """Walls ``(n, 4)`` from corner to corner, closed."""
+    return walls(corners).reshape(-1, 4)
 
 
 HALLWAY = walls(
@@ -27,12 +27,12 @@ HALLWAY = walls(
     ((0, 3), (0.5, 3), (0.5, 4.2), (0, 4.2)),
     ((9.3, 5), (10, 5), (10, 6), (9.6, 6.2)),
     ((4, 0), (4.3, 0.5), (5.5, 0.4), (5.6, 0)),
-)
+).reshape(-1, 4)
 
 
 def scan_at(walls: np.ndarray, pose: np.ndarray, random: np.random.Generator, farthest_m: float = 30.0) -> KeyScan:
     """A scan of 181 rays over 180 deg with 1 cm noise."""
-    nearest = cast(walls, pose, ANGLES)
+    nearest = cast(walls.reshape(-1, 2, 2), pose, ANGLES)
     noisy = nearest + random.normal(0.0, 0.01, len(nearest))
     return key_scan(0, ANGLES, np.where(nearest < farthest_m, noisy, np.inf), (0.05, farthest_m), MOUNTING)
 

@@ -109,7 +109,7 @@ FAR_OFF = outline((0, 20), (9, 20), (9, 27), (3, 29))
 @pytest.mark.parametrize(("apart_m", "believed"), [(4.08, False), (40.0, True)])
 def test_two_rooms_that_are_alike_are_refused_as_not_unique(apart_m: float, believed: bool) -> None:
     """The submap of the first visits holds both rooms: where both are in reach, neither is believed."""
-    walls = np.concatenate((ROOM, ROOM + (apart_m, 0), FAR_OFF))
+    walls = np.concatenate((ROOM, ROOM + (apart_m, 0, apart_m, 0), FAR_OFF))
     poses = visits((1.0, 1.5), (1.0 + apart_m, 1.5), (2, 22), (5, 22), (5, 24), (2, 24), (2, 22), (5, 24), (1.0, 1.5))
     config = ScanLoopConfig(every=1, place_step=1, submap_keys=11, least_gap_m=5.0)
     loops = found(scanned(walls, poses), poses, config, WindowConfig(least_m=5.0))
@@ -123,7 +123,7 @@ def test_walls_that_were_seen_through_are_refused() -> None:
     """A partition was built since the first visit: most lines fit, but they lie behind it."""
     poses = visits((1.0, 1.5), (2, 22), (5, 22), (5, 24), (2, 24), (2, 22), (5, 24), (1.0, 1.5))
     hall = np.concatenate((outline((0, 0), (7, 0), (7, 3), (5, 3), (5, 4), (0, 4)), FAR_OFF))
-    partition = np.array((((3.5, 0.8), (3.6, 2.4)),))
+    partition = np.array(((3.5, 0.8, 3.6, 2.4),))
     before, after = scanned(hall, poses[:-5]), scanned(np.concatenate((hall, partition)), poses[-5:])
     config = ScanLoopConfig(every=1, place_step=1, submap_keys=5, least_gap_m=5.0)
     tolerant = found(before + after, poses, dataclasses.replace(config, most_seen_through=1.0))
