@@ -187,3 +187,17 @@ def test_a_pane_that_the_map_does_not_show_is_not_touched_and_the_end_is_reached
     assert gaps.min() > 0.2
     assert np.array(way)[:, 0].max() < 6.2 and (known[40:50, 60:70] == 0).all()
     assert exploration.left(), "what lies behind it is named"
+
+
+@pytest.mark.parametrize(("away_m", "drives"), [(0.1, True), (0.25, False), (0.9, True)])
+def test_what_the_scan_shows_stops_it_unless_it_is_far_or_the_robot_itself(away_m: float, drives: bool) -> None:
+    exploration, _, robot = looking(ExplorerConfig(radius_m=0.2))
+    goal = exploration.decide(robot, 0.0)
+    assert goal is not None
+    robot[2] = math.atan2(*(goal.path[5] - goal.path[0])[::-1])
+    follower = PathFollower(DriveConfig(), exploration.need_m, 0.22)
+    follower.follow(goal.path, 0.0)
+    for step in range(5):
+        follower.look(np.array(((away_m, -0.02), (away_m, 0.02))), 0.1 * step)
+        speed, _ = follower.step(exploration.known, robot, 0.1 * step)
+    assert (speed > 0.1) == drives
