@@ -48,8 +48,8 @@ class PathFollower:
             self._tries, self._moved_at = 0, None
 
     def stop(self) -> None:
-        """Give the path up; the robot brakes."""
-        self._path, self.state = np.zeros((0, 2)), ARRIVED
+        """Give the path up; the robot brakes. What moves it until the next step is not known."""
+        self._path, self.state, self._sent = np.zeros((0, 2)), ARRIVED, []
 
     def look(self, hits_xy: Floats, seen_s: float) -> None:
         """Take the hits ``(n, 2)`` of the newest scan, in the robot's frame when it was taken.
