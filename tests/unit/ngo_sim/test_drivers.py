@@ -144,17 +144,17 @@ def test_a_driver_is_a_function_of_its_generator_and_the_poses(name: str) -> Non
     assert all(isinstance(action, Action) for action in actions(0))
 
 
-SEEN = ("###########",
-           "#         #",
-           "# ####### #",
-           "# #     # #",
-           "# # ### # #",
-           "# #   # # #",
-           "# ##### # #",
-           "#       # #",
-           "######### #",
-           "#         #",
-           "###########")  # fmt: skip
+BLOCKS = ("###########",
+          "#         #",
+          "# ####### #",
+          "# #     # #",
+          "# # ### # #",
+          "# #   # # #",
+          "# ##### # #",
+          "#       # #",
+          "######### #",
+          "#         #",
+          "###########")  # fmt: skip
 
 
 class Robot:
@@ -184,7 +184,7 @@ class Robot:
 
 
 def explore(seed: int, steps: int) -> tuple[ExploringDriver, list[tuple[int, int]], list[Action]]:
-    driver, robot = ExploringDriver(np.random.default_rng(seed)), Robot(SEEN, 4.5, 4.5)
+    driver, robot = ExploringDriver(np.random.default_rng(seed)), Robot(BLOCKS, 4.5, 4.5)
     blocks, actions = [robot.block()], []
     for _ in range(steps):
         actions.append(driver.action(robot.pose_xyyaw))
@@ -194,7 +194,7 @@ def explore(seed: int, steps: int) -> tuple[ExploringDriver, list[tuple[int, int
 
 
 def test_it_gets_about_in_a_spiral_that_it_has_no_plan_of() -> None:
-    free = sum(row.count(" ") for row in SEEN)
+    free = sum(row.count(" ") for row in BLOCKS)
     visited = [set(explore(seed, 6000)[1]) for seed in range(6)]
     assert min(map(len, visited)) > 0.5 * free
     assert np.mean([len(blocks) for blocks in visited]) > 0.7 * free
