@@ -44,7 +44,7 @@ _YEAR = """## A building that changes
 
 Made by `{command}`.
 
-One robot patrols each of {settings[years]} buildings of the {settings[split]} split: {settings[drives]} drives of
+One robot patrols each of {settings[years]} buildings ({settings[split]} split) in {settings[drives]} drives of
 {settings[year_scans]} scans of 360 rays, ten a second. Before each drive one piece in twenty of the furniture of rooms
 and halls is moved within its room; doors move and people walk all the time. Each drive begins at an unknown place with
 another odometry: the state that was saved is loaded, the robot is looked for in it, and the map grows from there, as
@@ -53,10 +53,10 @@ with `map_changes:=learn`. From {settings[most_scans]} key scans on, old ones le
 - Error: root mean square distance of the drive's positions, from where the robot was found on, after the best rigid
   motion. A drive in which the robot was never found has none.
 - IoU: of the cells of `/map` with those that exact rays from the true poses of its scans see in the building as it is
-  at the end of the drive. Cells have 5 cm: of the thin lines of occupied ones noise alone makes many differ. Where all
-  scans count alike, older ones are not bounded.
-- Localised: of {settings[starts]} starts in a drive, those whose way the map shows: a pose within 0.5 m and 5 degrees
-  is claimed within 50 scans, or 300. False claims: wrong ones at these starts, and where the drive itself was found.
+  at the end of the drive. Cells have 5 cm: of the thin lines of occupied ones noise alone makes many differ; and a door
+  that has moved since shows or hides what is behind it. Where all scans count alike, older ones are not bounded.
+- Localised: from {settings[starts]} starts in a drive, if the map shows the way there: a pose within 0.5 m and 5
+  degrees is claimed within 50 scans, or 300. False claims: wrong ones there, and where the drive itself was found.
 - Time a scan: computing time of odometry and correction; that of the map, drawn every 5 s, comes on top. Memory: all
   arrays of the saved state and of the map's scans."""
 
@@ -127,11 +127,11 @@ def _draw_fleets(path: Path, all_met: list[tuple[str, Measured]]) -> None:
 def _draw_year(path: Path, measured: Measured) -> None:
     names = ("first", "middle", "last")
     figure, axes = panels(6, 3, 6.0, 6.0)
-    corners = np.concatenate([measured.drawn[f"corners_{name}"] for name in names])
+    corners = np.concatenate([measured.drawn[f"{name}_corners"] for name in names])
     for kind, number_of_kind in (("found", 0), ("true", 1)):
         for name in names:
-            values, axis = measured.drawn[f"{kind}_{name}"], next(axes)
-            low = measured.drawn[f"corners_{name}"][number_of_kind]
+            values, axis = measured.drawn[f"{name}_{kind}"], next(axes)
+            low = measured.drawn[f"{name}_corners"][number_of_kind]
             high = low + _RESOLUTION_M * np.array(values.shape[::-1])
             grey = np.select([values < 0, values < 50], [0.75, 1.0], 0.0)
             extent = (low[0], high[0], low[1], high[1])

@@ -25,8 +25,8 @@ def test_the_motion_between_maps_is_found_again() -> None:
 def a_year(drives: int) -> Measured:
     """Its drive number ``n`` has the error n, needs n + 1 MB, and was not found at all where n is 5."""
     number = np.arange(float(drives))
-    empty = {f"{kind}_{when}": np.zeros((2, 2), np.int8) for kind in ("found", "true") for when in _WHEN}
-    corners = {f"corners_{when}": np.zeros((2, 2)) for when in _WHEN}
+    empty = {f"{when}_{kind}": np.zeros((2, 2), np.int8) for kind in ("found", "true") for when in _WHEN}
+    corners = {f"{when}_corners": np.zeros((2, 2)) for when in _WHEN}
     errors = {"ate_m": np.where(number == 5.0, np.nan, number), "memory_mb": number + 1.0, "ms_a_scan": number + 1.0}
     return Measured({**errors, "iou": 0.0 * number, "occupied_iou": 0.0 * number}, {**empty, **corners})
 
@@ -59,4 +59,5 @@ def test_a_year_goes_on_from_what_is_on_disk(tmp_path: Path, monkeypatch: pytest
     assert longer.errors["ate_m"][0] == first.errors["ate_m"][0] < 0.1
     assert longer.errors["iou"][0] > 0.8
     assert longer.errors["nodes"][1] >= longer.errors["nodes"][0] > 20
+    assert longer.drawn.keys() == a_year(2).drawn.keys()
     assert np.isnan(longer.errors["load_s"][0]) and longer.errors["load_s"][1] > 0.0

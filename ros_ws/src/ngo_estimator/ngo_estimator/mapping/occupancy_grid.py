@@ -1,6 +1,6 @@
 """An occupancy grid that scans can be taken out of again: it counts, and the counts of a scan are those of its pose.
 
-Log odds of occupancy grids (Moravec and Elfes 1985) are sums over scans. Here the sums are kept as two integers a cell,
+Log odds of occupancy grids (Moravec and Elfes 1985) are sums over scans. Here the sums are kept as integers a cell,
 so that a scan which moves is subtracted where it was, to the last bit, and added where it is.
 
 What was seen in the newest epoch in which a cell was seen is counted apart: what older epochs say is bounded, so that
