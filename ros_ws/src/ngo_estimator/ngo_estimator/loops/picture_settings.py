@@ -47,5 +47,7 @@ class PictureGraphConfig:
     """The graph of key pictures."""
 
     loops: PictureLoopConfig = field(default_factory=PictureLoopConfig)
+    # Deviation of the share by which the robot's odometry counts all ways wrong.
+    way_share: float = 0.02
     # Key pictures for which a loop waits at most before all are optimised.
     keys_between: int = 2

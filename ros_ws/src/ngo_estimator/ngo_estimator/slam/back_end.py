@@ -73,6 +73,10 @@ class BackEnd(ABC):
     def append(self, step: RelativeStep, taken: TakenStep) -> None:
         """Take a step to the next frame, and the motion that the log of steps has of it."""
 
+    def newest(self) -> tuple[np.ndarray, np.ndarray]:
+        """Pose ``(3,)`` of the newest frame in the map, and its covariance ``(3, 3)`` as it is published."""
+        return self.graph.newest()
+
     def may_join(self, step: RelativeStep) -> bool:
         """Whether another odometry may go on from this step's frame."""
         return True

@@ -159,7 +159,7 @@ class CorrectedTrajectory(ABC):
         """
         step = self._back_end.checked(step)
         self._work()  # it may move the newest pose
-        return self._join_at(step, *bridged(*self._back_end.graph.newest(), pose_xyyaw, covariance))
+        return self._join_at(step, *bridged(*self._back_end.newest(), pose_xyyaw, covariance))
 
     def _join_at(
         self, step: RelativeStep, relative: np.ndarray, covariance: np.ndarray, optimize: bool = True
@@ -283,7 +283,7 @@ class CorrectedTrajectory(ABC):
 
     def _result(self, restarted: bool, gap: bool) -> TrajectoryUpdate:
         back_end = self._back_end
-        pose, covariance = back_end.graph.newest()
+        pose, covariance = back_end.newest()
         map_from_odom = compose(pose, between(self._odom, np.zeros(3)))
         lost = back_end.lost_since
         return TrajectoryUpdate(

@@ -60,6 +60,12 @@ class PictureBackEnd(BackEnd):
             self._finder.append(KeyPicture.unpacked(step.place_code))
             self._is_key = True
 
+    def newest(self) -> tuple[np.ndarray, np.ndarray]:
+        """See ``BackEnd.newest``. No picture tells by which share all ways are wrong together: the map grows by it."""
+        pose, covariance = super().newest()
+        grown = np.array((*(self.config.way_share * pose[:2]), 0.0))
+        return pose, covariance + np.outer(grown, grown)
+
     def may_join(self, step: RelativeStep) -> bool:
         """Whether another odometry may go on from this step's frame, which needs a key picture."""
         return len(step.place_code) > 0
