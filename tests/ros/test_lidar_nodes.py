@@ -11,7 +11,7 @@ from nav_msgs.msg import Odometry
 from ngo_msgs.msg import RelativePose
 from ngo_msgs.srv import Reset
 from rclpy.qos import DurabilityPolicy, QoSProfile
-from sensor_msgs.msg import LaserScan
+from sensor_msgs.msg import Imu, LaserScan
 from tf2_msgs.msg import TFMessage
 
 from ngo_estimator.data.relative_step import RelativeStep
@@ -133,6 +133,7 @@ def test_live_nodes_follow_a_lidar(probe: Probe, robot_odometry: str, upside_dow
     scans = probe.node.create_publisher(LaserScan, "scan", 1000)
     wheels = probe.node.create_publisher(Odometry, "wheels", 1000)
     tf = probe.node.create_publisher(TFMessage, "/tf", 1000)
+    imu = probe.node.create_publisher(Imu, "imu", 1000)
     settings = {**RELIABLE, "robot_odometry": robot_odometry, "robot_odometry_topic": "wheels"}
     ngo_settings: dict[str, Any] = {"world": "scan"}
     odom_frame = "odom"
@@ -156,6 +157,9 @@ def test_live_nodes_follow_a_lidar(probe: Probe, robot_odometry: str, upside_dow
             odometry.pose.pose.orientation.z = math.sin(0.5 * wheel[2])
             odometry.pose.pose.orientation.w = math.cos(0.5 * wheel[2])
             wheels.publish(odometry)
+            reading = Imu(header=odometry.header)
+            reading.angular_velocity.z = 0.3 if 30 < step < FRAMES else 0.0
+            imu.publish(reading)
         if robot_odometry == "tf":
             tf.publish(transform_message(stamp_ns, odom_frame, "base_footprint", wheel))
         if robot_odometry != "none":
@@ -181,7 +185,7 @@ def test_live_nodes_follow_a_lidar(probe: Probe, robot_odometry: str, upside_dow
             lambda: (
                 scans.get_subscription_count() == 1
                 and static.get_subscription_count() == 1
-                and (robot_odometry != "topic" or wheels.get_subscription_count() == 1)
+                and (robot_odometry != "topic" or wheels.get_subscription_count() == imu.get_subscription_count() == 1)
                 and (robot_odometry != "tf" or tf.get_subscription_count() == 2)
             ),
             "the estimators",
@@ -224,6 +228,8 @@ def test_live_nodes_follow_a_lidar(probe: Probe, robot_odometry: str, upside_dow
 
         probe.spin_until(all_came, "every message about every scan")
         assert "dropped" not in local.log + ngo.log, local.log + ngo.log
+        if robot_odometry == "topic":  # and it is heard
+            local.wait_for_log("the IMU is not used")
     out = out.since(BEGIN_NS)
     assert len(out.relative_poses) == FRAMES - 1
     assert_expected(out.relative_poses)

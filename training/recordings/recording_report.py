@@ -168,6 +168,7 @@ def topic_uses(recording: Recording, topics: RecordingTopics) -> dict[str, str]:
         by_tf = transform_topics(recording, topics.image)
         for wheels in [topics.wheels.topic] if topics.wheels.tf is None else by_tf:
             use(wheels, f"wheels ({topics.wheels})")
+    use(topics.imu, "yaw rate of the IMU")
     truth = topics.ground_truth
     if truth is not None and truth.tf is not None:
         for name, info in recording.topics.items():

@@ -24,7 +24,8 @@ class LidarDescription:
 
     rays, angles, field_of_view (rad) and range_max (m) are those of the first scan. rate_hz: from the median step
     between the first 200 stamps; None where stamps do not tell it. mounting, wheels: None where there are none.
-    stamps: "recorded", "made from the order of messages", or "none". notes: sentences with what to look at.
+    stamps: "recorded", "made from the order of messages", or "none". imu: topic and rate, nothing where
+    there is none. notes: sentences with what to look at.
     """
 
     scan_topic: str
@@ -39,6 +40,7 @@ class LidarDescription:
     wheels: WheelSource | None
     wheel_poses: int
     stamps: str
+    imu: str
     notes: tuple[str, ...]
 
     def looking_at(self, yaw_rad: float) -> LidarDescription:
@@ -62,6 +64,7 @@ class LidarDescription:
             f"mounting: {self.mounting if self.mounting is not None else 'not in the recording'}",
             f"wheels: {wheels}",
             f"stamps: {self.stamps}",
+            *([f"IMU: {self.imu}"] if self.imu else ()),
             *(f"note: {note}" for note in self.notes),
         ]
 
@@ -148,5 +151,6 @@ def describe_lidar(recording: Recording, topics: RecordingTopics) -> LidarDescri
         wheels=wheels,
         wheel_poses=recording.topics[wheels.topic].count if wheels is not None and wheels.topic is not None else 0,
         stamps=kind,
+        imu="" if topics.imu is None else _with_rate(recording, topics.imu),
         notes=tuple(notes),
     )

@@ -1,4 +1,4 @@
-"""A recording as scans and wheel poses in order of time, for estimators that use both."""
+"""A recording as scans, wheel poses and yaw rates in order of time, for estimators that use them."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ import numpy as np
 
 from ngo_recordings.association import RESTART_NS, header_stamp_ns
 from ngo_recordings.errors import RecordingError
+from ngo_recordings.imu import recorded_up_axis, yaw_rate
 from ngo_recordings.laser_scan import LEAST_INCREMENT, LidarScan, is_increment
 from ngo_recordings.odometry_poses import OdometryPoses
 from ngo_recordings.recording import Message, Recording
@@ -18,10 +19,11 @@ from ngo_recordings.space_scan import scan_reader
 from ngo_recordings.topics import RecordingTopics, WheelSource, transform_topics
 from ngo_recordings.transform_buffer import FramePoses, TransformBuffer
 
-__all__ = ["BAD_SCAN", "BAD_WHEELS", "LidarScan", "WheelPose", "scan_stream", "wheel_poses"]
+__all__ = ["BAD_SCAN", "BAD_WHEELS", "LidarScan", "WheelPose", "YawRate", "scan_stream", "wheel_poses"]
 
 BAD_SCAN = "damaged scan"
 BAD_WHEELS = "wheel pose that is no number"
+BAD_IMU = "reading of the IMU without a stamp"
 
 # How late a message may be recorded after one with a later stamp, and still come in order.
 _WAIT_NS = 1_000_000_000
@@ -37,14 +39,23 @@ class WheelPose:
     pose_xyyaw: np.ndarray
 
 
+@dataclass(frozen=True)
+class YawRate:
+    """Turn rate of an IMU about the robot's z, counter-clockwise, ``rate_rps``: rad/s."""
+
+    stamp_ns: int
+    rate_rps: float
+
+
 def scan_stream(
     recording: Recording,
     topics: RecordingTopics,
     angle_increment: float | None = None,
     skipped: Counter[str] | None = None,
     wheels_ahead_s: float | None = None,
-) -> Iterator[LidarScan | WheelPose]:
-    """Scans of topics.scans and poses of topics.wheels in order of their stamps; at equal stamps wheels come first.
+) -> Iterator[LidarScan | WheelPose | YawRate]:
+    """Scans of topics.scans, poses of topics.wheels and rates of topics.imu in order of their stamps; at equal stamps
+    scans come last.
 
     A message that was recorded up to 1 s after one with a later stamp comes at its place. Stamps that jump back by 1 s
     begin anew, as a source that restarted does.
@@ -53,8 +64,8 @@ def scan_stream(
         angle_increment: rad, instead of that of the messages; None: see `scan_angles`.
         wheels_ahead_s: how far the stamps of the wheels are ahead, which come in the order of the scans' clock then.
             None: not known; clocks that are far apart are told by when the first messages were recorded.
-        skipped: counts what gave no record, by the reason (BAD_SCAN, BAD_WHEELS). None: a damaged scan is an error, and
-            poses that are no numbers are left out.
+        skipped: counts what gave no record, by the reason (BAD_SCAN, BAD_WHEELS, BAD_IMU). None: a damaged scan is
+            an error, and poses that are no numbers are left out.
 
     Raises:
         RecordingError: topics.image holds no scans, scans have no stamps, or one is damaged.
@@ -64,25 +75,30 @@ def scan_stream(
         raise RecordingError(f"the increment is {angle_increment:g} rad; expected at least {LEAST_INCREMENT:g} rad")
     wheels = None if topics.wheels is None else _Wheels(recording, topics.wheels, topics.image)
     names = {*topics.scans, *(wheels.names if wheels is not None else ())}
+    if topics.imu is not None:
+        names.add(topics.imu)
+        up = recorded_up_axis(recording, topics)
     lost: Counter[str] = Counter() if skipped is None else skipped
-    waiting: list[tuple[int, bool, int, int, LidarScan | WheelPose]] = []
+    waiting: list[tuple[int, bool, int, int, LidarScan | WheelPose | YawRate]] = []
     newest: dict[str, int] = {}
     late: dict[bool, int] = {}
     ahead_ns = 0 if wheels_ahead_s is None else round(wheels_ahead_s * 1e9)
     for order, message in enumerate(recording.messages(names)):
         is_scan = message.topic in topics.scans
         try:
-            found: list[LidarScan | WheelPose] = (
-                [readers[message.topic](message.value)]
-                if is_scan
-                else list(wheels.read(message, lost) if wheels else ())
-            )
+            found: list[LidarScan | WheelPose | YawRate]
+            if is_scan:
+                found = [readers[message.topic](message.value)]
+            elif message.topic == topics.imu:
+                found = [YawRate(header_stamp_ns(message.value), yaw_rate(message.value, up))]
+            else:
+                found = list(wheels.read(message, lost) if wheels else ())
         except AttributeError as error:
             raise RecordingError(f"a message of {message.topic} is not what its type should be ({error})") from None
         except RecordingError:
             if skipped is None:
                 raise
-            lost[BAD_SCAN if is_scan else BAD_WHEELS] += 1
+            lost[BAD_SCAN if is_scan else BAD_WHEELS if message.topic != topics.imu else BAD_IMU] += 1
             continue
         for record in found:
             before = newest.get(message.topic)
@@ -93,7 +109,8 @@ def scan_stream(
                     yield heapq.heappop(waiting)[-1]
                 newest.clear()
             newest[message.topic] = max(record.stamp_ns, newest.get(message.topic, 0))
-            late.setdefault(is_scan, record.stamp_ns - message.log_time_ns)
+            if not isinstance(record, YawRate):
+                late.setdefault(is_scan, record.stamp_ns - message.log_time_ns)
             apart_ns = late[False] - late[True] if len(late) == 2 else 0
             if wheels_ahead_s is None and abs(apart_ns) > _OTHER_CLOCK_NS:
                 ahead_ns = apart_ns

@@ -18,6 +18,7 @@ ODOMETRY_TYPE = "nav_msgs/msg/Odometry"
 TWIST_TYPES = ("geometry_msgs/msg/TwistStamped", "geometry_msgs/msg/Twist", ODOMETRY_TYPE)
 POSE_TYPES = (ODOMETRY_TYPE, "geometry_msgs/msg/PoseStamped", "geometry_msgs/msg/PoseWithCovarianceStamped")
 TF_TYPE = "tf2_msgs/msg/TFMessage"
+IMU_TYPE = "sensor_msgs/msg/Imu"
 
 _NONE = "none"
 _SCANS = (SCAN_TYPE, CLOUD_TYPE, IMAGE_TYPE)  # of depth
@@ -115,6 +116,8 @@ class TopicArguments:
     """Topics of several scanners, whose scans are put together; the first one is the image."""
     wheels: str | None = None
     """Wheel odometry: a topic of Odometry, or tf:PARENT:CHILD; chosen for scans alone."""
+    imu: str | None = None
+    """Topic of an Imu, whose yaw rate stands in for the wheels' turns where it agrees better with the scans."""
 
     def __post_init__(self) -> None:
         _check_times(self.tolerance_s, self.interpolation_s, self.twist_tolerance_s)
@@ -125,8 +128,8 @@ class RecordingTopics:
     """What is used for what; None: nothing. `choose_topics` makes one that fits the recording.
 
     image: Image, CompressedImage, LaserScan or PointCloud2. depth: Image of depth, one more channel. action:
-    DiscreteAction. twist: Twist, TwistStamped or Odometry. wheels: wheel odometry, for `scan_stream`. more_scans: those
-    of other scanners. The times are those of TopicArguments.
+    DiscreteAction. twist: Twist, TwistStamped or Odometry. wheels, imu: wheel odometry and Imu, for `scan_stream`.
+    more_scans: those of other scanners. The times are those of TopicArguments.
     """
 
     image: str
@@ -139,6 +142,7 @@ class RecordingTopics:
     twist_tolerance_s: float = 0.5
     wheels: WheelSource | None = None
     more_scans: tuple[str, ...] = ()
+    imu: str | None = None
 
     def __post_init__(self) -> None:
         _check_times(self.tolerance_s, self.interpolation_s, self.twist_tolerance_s)
@@ -158,7 +162,7 @@ def choose_topics(
     is a DiscreteAction that is no command; the twist, where there is no action, the only Twist or TwistStamped; the
     ground truth an Odometry or pose topic whose name says so. Where the image is of scans, or with_wheels, the wheels
     are the first of `wheel_candidates`, if it is the only one or its name says so; where there is none, the transform
-    from odom to the robot. Nothing else is guessed.
+    from odom to the robot. With wheels, the IMU is the first of this robot. Nothing else is guessed.
 
     Raises:
         RecordingError: a topic that is given is not there, empty or of another type, or the image topic is not clear.
@@ -174,6 +178,11 @@ def choose_topics(
     if given.twist is None and action is None:
         twist = _only(_filled(recording, TWIST_TYPES[:2]))
     truth = _choose_truth(recording, given.ground_truth)
+    wheels = _choose_wheels(recording, given.wheels, image, truth, bool(scans) or with_wheels)
+    imu = _given(recording, "IMU", given.imu, (IMU_TYPE,))
+    if given.imu is None and wheels is not None:
+        names = _filled(recording, (IMU_TYPE,))
+        imu = min((name for name in names if _related(name, image)), default=_only(names))
     return RecordingTopics(
         image=image,
         depth=_given(recording, "depth", given.depth, (IMAGE_TYPE,)),
@@ -183,7 +192,8 @@ def choose_topics(
         tolerance_s=given.tolerance_s,
         interpolation_s=given.interpolation_s,
         twist_tolerance_s=given.twist_tolerance_s,
-        wheels=_choose_wheels(recording, given.wheels, image, truth, bool(scans) or with_wheels),
+        wheels=wheels,
+        imu=imu,
         more_scans=tuple(name for name in more if name is not None),
     )
 

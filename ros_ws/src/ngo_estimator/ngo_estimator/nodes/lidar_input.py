@@ -9,12 +9,13 @@ from typing import Any
 import numpy as np
 from rclpy.node import Node
 from rclpy.qos import QoSProfile, ReliabilityPolicy
-from sensor_msgs.msg import CameraInfo, Image, LaserScan, PointCloud2
+from sensor_msgs.msg import CameraInfo, Image, Imu, LaserScan, PointCloud2
 
 from ngo_estimator.data.relative_step import RelativeStep
 from ngo_estimator.frontend.intake.lidar_intake import LidarIntake
 from ngo_estimator.frontend.lidar.mixture_lidar import MixtureLidar
 from ngo_estimator.geometry.scan_points import Mounting
+from ngo_estimator.nodes import messages
 from ngo_estimator.nodes.listening import Listening
 from ngo_estimator.nodes.odometry_on_tf import OdometryOnTf
 from ngo_estimator.nodes.robot_odometry import RobotOdometry
@@ -23,6 +24,7 @@ from ngo_estimator.nodes.status import NodeStatus
 from ngo_estimator.nodes.weights import load_core
 from ngo_estimator.offline.compiling import compiling
 from ngo_estimator.offline.warm_up import warm_up_odometry
+from ngo_recordings.imu import up_axis, yaw_rate
 from ngo_recordings.laser_scan import LidarScan, scan_of
 from ngo_recordings.mounting import Mounting as KnownMounting
 from ngo_recordings.mounting import mounting_in
@@ -31,6 +33,7 @@ from ngo_recordings.space_scan import cloud_scan, depth_scan, info_topic
 _TYPES = {"LaserScan": LaserScan, "PointCloud2": PointCloud2, "depth": Image}
 _MOUNTING_WAIT_NS = 2_000_000_000
 _MOST_HELD = 200
+_MOST_READINGS = 1000
 
 
 class LidarInput:
@@ -75,6 +78,14 @@ class LidarInput:
             if settings.scan_type == "depth":
                 listening.to_all(CameraInfo, info_topic(topic), partial(self._on_info, topic), scans)
         self._robot.listen(listening, status)
+        if settings.robot_odometry != "none":  # an IMU alone does not know the way
+            readings = QoSProfile(depth=_MOST_READINGS, reliability=ReliabilityPolicy.BEST_EFFORT)
+            listening.to_all(Imu, settings.imu_topic, self._on_imu, readings)
+
+    def _on_imu(self, message: Imu) -> None:
+        frame = message.header.frame_id.strip("/")
+        pose = self._robot.transforms.newest_lookup(self._robot.base_frame, frame)
+        self._core.add_imu(messages.to_ns(message.header.stamp), yaw_rate(message, up_axis(pose)))
 
     def _on_transforms(self, static: bool) -> None:
         for frame, known in list(self._mountings.items()):

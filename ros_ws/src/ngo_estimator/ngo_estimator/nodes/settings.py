@@ -138,6 +138,11 @@ class LocalNodeSettings(EstimatorSettings):
         choices=("none", "topic", "tf"),
     )
     robot_odometry_topic: str = topic("wheel_odom", "Odometry of the robot, with robot_odometry:=topic.")
+    imu_topic: str = topic(
+        "imu",
+        "IMU whose yaw rate stands in for the turns of the robot's odometry, with world:=scan, where it agrees better "
+        "with the scans.",
+    )
     image_reliability: str = setting(
         "best_effort",
         "Reliability of image_topic or scan_topic; reliable: lost messages are sent again.",

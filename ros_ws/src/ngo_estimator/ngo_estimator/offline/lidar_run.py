@@ -15,7 +15,9 @@ from ngo_estimator.offline.recorded import RecordedRun, RecordedStep, Truth
 from ngo_estimator.slam.scan_trajectory import ScanTrajectory
 from ngo_estimator.slam.trajectory_update import Trajectory
 from ngo_estimator.trajectory.files import seconds
-from ngo_recordings.scan_stream import LidarScan, WheelPose
+from ngo_recordings.scan_stream import LidarScan, WheelPose, YawRate
+
+LidarRecord = LidarScan | WheelPose | YawRate
 
 _REASONS: dict[type[ValueError], str] = {
     DuplicateFrame: "the stamp came twice",
@@ -95,13 +97,13 @@ class LidarRun:
             lines.append(f"{len(self.faults)} faults, where it went on by odometry (first: {self.faults[0]})")
         return lines
 
-    def learn(self, records: Iterable[LidarScan | WheelPose]) -> WheelTruth:
+    def learn(self, records: Iterable[LidarRecord]) -> WheelTruth:
         """Look at the beginning of a recording for what is to be known of scanners and wheels, before a run.
 
         Where scans get lost by the wheels, scans alone are asked. Returns what is wrong with the wheels. Live, it is
         learned on the way.
         """
-        read: list[LidarScan | WheelPose] = []
+        read: list[LidarRecord] = []
         lost = self._look_at(records, read)
         if lost and self._odometry.has_wheels:
             self._odometry.reset()
@@ -111,7 +113,7 @@ class LidarRun:
         self._odometry.reset()
         return known
 
-    def _look_at(self, records: Iterable[LidarScan | WheelPose], read: list[LidarScan | WheelPose]) -> bool:
+    def _look_at(self, records: Iterable[LidarRecord], read: list[LidarRecord]) -> bool:
         """Go over records until enough is known, and keep what was read; returns whether scans got lost."""
         scans, unsure, way_m, turn_rad = 0, 0, 0.0, 0.0
         for record in records:
@@ -119,6 +121,8 @@ class LidarRun:
             with suppress(ValueError):
                 if isinstance(record, WheelPose):
                     self._odometry.add_wheels(record.stamp_ns, record.pose_xyyaw)
+                elif isinstance(record, YawRate):
+                    self._odometry.add_imu(record.stamp_ns, record.rate_rps)
                 else:
                     scans += 1
                     self._odometry.add_scan(record)
@@ -130,9 +134,7 @@ class LidarRun:
                 break
         return unsure > _LOST_SHARE * scans
 
-    def run(
-        self, records: Iterable[LidarScan | WheelPose], truth: Truth | None = None
-    ) -> Iterator[RecordedStep | RecordedRun]:
+    def run(self, records: Iterable[LidarRecord], truth: Truth | None = None) -> Iterator[RecordedStep | RecordedRun]:
         """Every step, and after the last one of a trajectory the whole of it.
 
         A recording whose stamps jump back by a second or more holds several trajectories.
@@ -145,6 +147,8 @@ class LidarRun:
                     self._odometry.add_wheels(record.stamp_ns, record.pose_xyyaw)
                 except ValueError as error:
                     self._reject("wheel pose not usable", f"{seconds(record.stamp_ns)} s: {error}")
+            elif isinstance(record, YawRate):
+                self._odometry.add_imu(record.stamp_ns, record.rate_rps)
             else:
                 self.frames += 1
                 restarts = self._odometry.restarts

@@ -1,11 +1,13 @@
 """What stands before the front end of a lidar: scans as they should be, of all scanners together (no ROS here)."""
 
+from collections import deque
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 
 import numpy as np
 
 from ngo_estimator.data.relative_step import LARGEST_ODOMETRY
+from ngo_estimator.frontend.intake.imu_turns import ImuTurns
 from ngo_estimator.frontend.intake.mounting_yaw import MountingYaw
 from ngo_estimator.frontend.intake.no_return import NoReturnValues
 from ngo_estimator.frontend.intake.own_returns import OwnReturns
@@ -44,6 +46,7 @@ class LidarIntake:
         self._own: dict[str, OwnReturns] = {}
         self._sweeps: dict[str, MeasuredSweep] = {}
         self._clock = WheelClock()
+        self._imu = ImuTurns()
         self.reset()
 
     def reset(self) -> None:
@@ -55,7 +58,9 @@ class LidarIntake:
         self._mountings: dict[str, Mounting | None] = {}
         for sweep in self._sweeps.values():
             sweep.interrupt()
-        self._wheels = CorrectedWheels()
+        self._imu.interrupt()
+        self._wheels = CorrectedWheels(self._imu)
+        self._waiting_wheels: deque[WheelPose] = deque()
         self._yaw = MountingYaw()
         clock = WheelClock()
         clock.truth = self._clock.truth
@@ -94,6 +99,22 @@ class LidarIntake:
             raise ValueError(f"the wheels' pose is {pose_xyyaw}; expected three numbers up to {LARGEST_ODOMETRY:g}")
         for wheels in self._stray_wheels.add(WheelPose(stamp_ns, pose_xyyaw)):
             self._clock.add_wheels(wheels.stamp_ns, wheels.pose_xyyaw)
+            self._waiting_wheels.append(wheels)
+        self._hand_on_wheels()
+
+    def add_imu(self, stamp_ns: int, yaw_rate_rps: float) -> None:
+        """Take an IMU's yaw rate about the robot's z."""
+        self._imu.add(stamp_ns, yaw_rate_rps)
+        self._hand_on_wheels()
+
+    def _hand_on_wheels(self, at_end: bool = False) -> None:
+        """Give the front end the wheels whose turn the IMU knows by now."""
+        offset_ns = round(self._clock.truth.offset_s * 1e9)
+        while self._waiting_wheels:
+            wheels = self._waiting_wheels[0]
+            if self._imu.used and not at_end and not self._imu.reached(wheels.stamp_ns - offset_ns):
+                return
+            self._waiting_wheels.popleft()
             at_ns, pose = self._wheels.add(wheels.stamp_ns, wheels.pose_xyyaw, self._clock.truth)
             if not self._clock.truth.useless:
                 self.front_end.add_wheels(at_ns, pose)
@@ -151,6 +172,7 @@ class LidarIntake:
             UnusableImage: a scan has no usable ray. It is gone; call again for the next.
         """
         if at_end:
+            self._hand_on_wheels(at_end)
             for scan in self._stray_scans.flush():
                 self._take(scan)
             self._hand_on(self._turns.flush())
@@ -170,6 +192,12 @@ class LidarIntake:
             self._yaw.interrupt()
         else:
             self._yaw.observe(step.relative_xyyaw, motion, elapsed_s)
+        counted = self._wheels.turn(step.from_stamp_ns - late_ns, step.stamp_ns - late_ns)
+        if counted is not None and not step.unsure:
+            early_ns = late_ns + round(self._clock.truth.age_s * 1e9)
+            begin_ns, end_ns = step.from_stamp_ns - early_ns, step.stamp_ns - early_ns
+            by_wheels = counted * self._clock.truth.turn_scale
+            self._imu.observe(begin_ns, end_ns, float(step.relative_xyyaw[2]), by_wheels)
         for scanner, sweep in self._sweeps.items():
             if self._turns.alone and (mounting := self._mountings.get(scanner)) is not None:
                 sweep.observe(step.stamp_ns, step.relative_xyyaw, motion, elapsed_s, mounting)
@@ -198,6 +226,7 @@ class LidarIntake:
                 lines.append(f"{name} says {values} m where nothing came back: taken so")
         lines += [f"{name}: {line}" for name, sweep in self._sweeps.items() if (line := sweep.remark())]
         lines += self._clock.truth.remarks()
+        lines += [line] if (line := self._imu.remark()) else []
         for name, stray in (("scans", self._stray_scans), ("wheels", self._stray_wheels)):
             if stray.left_out:
                 lines.append(f"{stray.left_out} of the {name} are stamped far from those before and after: left out")

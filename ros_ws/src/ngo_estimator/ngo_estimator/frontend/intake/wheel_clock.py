@@ -10,6 +10,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from ngo_estimator.frontend.intake.imu_turns import ImuTurns
 from ngo_estimator.geometry.planar_motion import Array, between, compose, wrap
 
 _CELL_S = 0.05
@@ -229,10 +230,11 @@ def _far_off(scale: float) -> float:
 class CorrectedWheels:
     """The wheels with what is known of them: their poses by the scans' clock, and by the scans' scale.
 
-    A step that no robot makes, as where a driver begins anew, is none.
+    A step that no robot makes, as where a driver begins anew, is none. Where an IMU is used, turns are its own.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, imu: ImuTurns) -> None:
+        self._imu = imu
         self._raw: deque[tuple[int, Array]] = deque(maxlen=2000)
         self._poses: deque[tuple[int, Array]] = deque(maxlen=2000)
         self._changed = False  # whether poses are no longer as the wheels say
@@ -251,6 +253,9 @@ class CorrectedWheels:
             way, turn = math.hypot(step[0], step[1]), abs(step[2])
             if way > _FASTEST[0] * elapsed_s + _AT_ONCE[0] or turn > _FASTEST[1] * elapsed_s + _AT_ONCE[1]:
                 step, self._changed = np.zeros(3), True
+            elif self._imu.used:
+                offset_ns = round(truth.offset_s * 1e9)
+                step, self._changed = self._turned(step, self._raw[-1][0] - offset_ns, stamp_ns - offset_ns), True
             self._changed |= (truth.turn_scale, truth.way_scale) != (1.0, 1.0)
             if self._changed:
                 scaled = compose(self._poses[-1][1], step)
@@ -259,6 +264,15 @@ class CorrectedWheels:
             self._raw.append((stamp_ns, pose))
             self._poses.append(made)
         return made
+
+    def _turned(self, step: Array, from_ns: int, to_ns: int) -> Array:
+        """A step of the wheels with the turn of the IMU, on the arc that belongs to it."""
+        turn = self._imu.turn(from_ns, to_ns)
+        if turn is None:
+            return step
+        half = 0.5 * (turn - float(step[2]))
+        cos, sin = math.cos(half), math.sin(half)
+        return np.array((cos * step[0] - sin * step[1], sin * step[0] + cos * step[1], turn))
 
     def again(self, truth: WheelTruth) -> list[tuple[int, Array]]:
         """The last poses with what is known by now."""
@@ -271,6 +285,11 @@ class CorrectedWheels:
         """The motion ``(3,)`` between two stamps; None where it is not known."""
         begin, end = self._at(self._poses, from_ns), self._at(self._poses, to_ns)
         return None if begin is None or end is None else between(begin, end)
+
+    def turn(self, from_ns: int, to_ns: int) -> float | None:
+        """The turn between two stamps as the wheels say it (rad); None where it is not known."""
+        begin, end = self._at(self._raw, from_ns), self._at(self._raw, to_ns)
+        return None if begin is None or end is None else wrap(float(end[2] - begin[2]))
 
     def said(self, stamp_ns: int) -> Array | None:
         """The pose ``(3,)`` as the wheels say it, at a stamp by the scans' clock; None where it is not known, or is

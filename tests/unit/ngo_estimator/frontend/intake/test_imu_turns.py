@@ -1,0 +1,69 @@
+"""An IMU's turns stand in for those of slipping wheels, and a bad one does no harm."""
+
+import math
+
+import numpy as np
+import pytest
+
+from ngo_estimator.frontend.intake.imu_turns import ImuTurns
+from ngo_estimator.frontend.intake.wheel_clock import CorrectedWheels, WheelTruth
+
+PERIOD_NS = 100_000_000
+BIAS_RPS = 0.03
+
+
+def yaw(time_s: float) -> float:
+    return math.sin(0.9 * time_s) + 0.5 * math.sin(2.3 * time_s)
+
+
+def rate(time_s: float) -> float:
+    return 0.9 * math.cos(0.9 * time_s) + 1.15 * math.cos(2.3 * time_s)
+
+
+def heard(imu: ImuTurns, late_s: float, factor: float, slip_rad: float, steps: int = 150) -> None:
+    """Readings of 100 Hz and steps between scans, of which one in ten slips."""
+    noise = np.random.default_rng(0)
+    for k in range(steps):
+        for reading in range(10):
+            time_s = 0.1 * k + 0.01 * reading
+            said = factor * rate(time_s) + BIAS_RPS + float(noise.normal(0.0, 0.01))
+            imu.add(10**9 + round((time_s + late_s) * 1e9), said)
+        turn = yaw(0.1 * k) - yaw(0.1 * (k - 1))
+        by_scans, slip = turn + float(noise.normal(0.0, 0.002)), slip_rad * (k % 10 == 0)
+        imu.observe(10**9 + (k - 1) * PERIOD_NS, 10**9 + k * PERIOD_NS, by_scans, turn + slip)
+
+
+@pytest.mark.parametrize("late_s", [0.0, 0.1, -0.3])
+def test_its_turns_are_used_where_wheels_slip_with_its_bias_and_delay_taken_out(late_s: float) -> None:
+    imu = ImuTurns()
+    heard(imu, late_s, 1.0, slip_rad=0.1)
+    assert imu.used and "stand in for the wheels'" in imu.remark()
+    assert imu.late_ns == pytest.approx(late_s * 1e9) and imu.bias_rps == pytest.approx(BIAS_RPS, abs=0.005)
+    turn = imu.turn(10**9 + 120 * PERIOD_NS, 10**9 + 130 * PERIOD_NS)
+    assert turn == pytest.approx(yaw(13.0) - yaw(12.0), abs=0.01)
+
+
+@pytest.mark.parametrize(
+    ("late_s", "factor", "slip_rad"),
+    [(0.0, 1.0, 0.0), (0.0, -1.0, 0.1), (0.0, 0.0, 0.1), (0.3, 1.0, 0.1), (0.0, 57.3, 0.1)],
+)
+def test_it_is_not_used_where_wheels_are_good_or_it_is_wrong(late_s: float, factor: float, slip_rad: float) -> None:
+    imu = ImuTurns()
+    heard(imu, late_s, factor, slip_rad)
+    assert not imu.used and "is not used" in imu.remark()
+
+
+def test_wheels_go_on_along_the_arc_of_its_turn() -> None:
+    """They count a quarter of a circle as a straight line."""
+    imu = ImuTurns()
+    heard(imu, 0.0, 1.0, slip_rad=0.1)
+    imu.interrupt()
+    for k in range(0, 1001, 10):
+        imu.add(10**12 + k * 10**6, 0.5 * math.pi + imu.bias_rps)
+    wheels = CorrectedWheels(imu)
+    for k in range(11):
+        at = 10**12 + k * PERIOD_NS
+        _, pose = wheels.add(at, np.array((0.1 * k, 0.0, 0.0)), WheelTruth())
+    radius = 2.0 / math.pi
+    np.testing.assert_allclose(pose, [radius, radius, 0.5 * math.pi], atol=0.01)
+    assert wheels.said(at) == pytest.approx([1.0, 0.0, 0.0]), "what the robot says stays as it is"
