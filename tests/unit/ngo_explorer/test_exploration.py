@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from ngo_explorer.exploration import Exploration
-from ngo_explorer.path_follower import ARRIVED, STUCK, PathFollower
+from ngo_explorer.path_follower import ARRIVED, DRIVING, STUCK, PathFollower
+from ngo_explorer.pilot import DONE, RETURNING, Pilot
 from ngo_explorer.settings import RULES, DriveConfig, ExplorerConfig
 
 from .drawn_maps import RESOLUTION_M, drawn, explore, seen_from
@@ -132,6 +133,46 @@ def test_a_robot_that_is_carried_away_decides_anew() -> None:
     exploration.decide(robot, 0.0)
     assert not exploration.due(robot, 0.1)
     assert exploration.due(robot + (0.0, 2.0, 0.0), 0.2)
+
+
+RING = drawn("#########", "#.......#", "#.#####.#", "#.......#", "#########", cells=10)
+HOME = np.array((7.5, 1.5, 0.0))
+
+
+class Nobody:
+    """A driver that does nothing: the goals are for somebody who does not come."""
+
+    state = DRIVING
+
+    def follow(self, path: np.ndarray, yaw: float, new: bool) -> None:
+        self.state = DRIVING if len(path) > 2 else ARRIVED
+
+    def stop(self) -> None:
+        self.state = ARRIVED
+
+
+@pytest.mark.parametrize(("closed", "drives"), [(1, True), (2, True), (0, False)])
+def test_the_way_home_is_planned_anew_and_a_robot_that_does_not_get_there_says_so(closed: int, drives: bool) -> None:
+    exploration, robot, truth = Exploration(ExplorerConfig(radius_m=0.2)), np.array((1.5, 1.5, 0.0)), RING.copy()
+    driver = PathFollower(DriveConfig(), 0.3, 0.225) if drives else Nobody()
+    pilot, begun_s = Pilot(exploration, driver, 0.5, HOME), math.inf
+    for step in range(1500):
+        exploration.known.update(truth, RESOLUTION_M, np.zeros(2))
+        pilot.step(robot, 0.1 * step)
+        if pilot.state == DONE:
+            break
+        begun_s = min(begun_s, 0.1 * step) if pilot.state == RETURNING else begun_s
+        if robot[0] > 3.0:
+            truth[10:20, 50] = 100 if closed else 0  # on the way, and on the way around
+            truth[30:40, 50] = 100 if closed == 2 else 0
+        if isinstance(driver, PathFollower):
+            speed, turn_rate = driver.step(exploration.known, robot, 0.1 * step)
+            robot = robot + 0.1 * np.array((speed * math.cos(robot[2]), speed * math.sin(robot[2]), turn_rate))
+    assert pilot.state == DONE
+    home = float(np.hypot(*(robot - HOME)[:2])) < 0.3
+    assert home == (closed == 1 and drives)
+    assert [left.reason for left in exploration.left()] == ([] if home else ["the robot did not get back to the start"])
+    assert home or 0.1 * step - begun_s < 30.0
 
 
 def test_the_same_map_and_seed_give_the_same_goals() -> None:

@@ -61,16 +61,20 @@ def test_a_robot_that_does_not_know_its_deviation_explores_as_ever() -> None:
     np.testing.assert_array_equal(*goals)
 
 
-def test_it_goes_back_once_before_a_frontier_and_then_there() -> None:
+def test_it_goes_back_once_before_each_frontier_and_by_new_paths() -> None:
     truth = CORRIDOR.copy()
-    truth[1:-1, 200:] = -1
+    truth[1:-1, 280:] = truth[1:-1, :30] = -1
     exploration = Exploration(ExplorerConfig(radius_m=0.2, accurate_m=0.055), accurate=True)
     exploration.known.update(truth, RESOLUTION_M, np.zeros(2))
-    for x, deviation_m in ((2.0, 0.0), (16.0, 0.0), (12.0, 0.05)):
-        exploration.deviation_m = deviation_m
-        goal = exploration.decide(np.array((x, 1.0, 0.0)), x)
-    assert goal is not None and goal.candidate is None
-    np.testing.assert_array_equal(goal.pose_xyyaw[:2], (16.0, 1.0))
-    exploration.arrived()
-    goal = exploration.decide(np.array((16.0, 1.0, 0.0)), 30.0)
-    assert goal is not None and goal.candidate is not None
+    went = []
+    for now_s, (x, deviation_m) in enumerate(((4.0, 0.0), (16.0, 0.0), (19.0, 0.054), (12.0, 0.054), (19.0, 0.054))):
+        exploration.deviation_m, robot = deviation_m, np.array((x, 1.0, 0.0))
+        goal = exploration.decide(robot, 10.0 * now_s)
+        assert goal is not None
+        went.append(goal.candidate is None)
+        if went[-1]:
+            assert not exploration.due(robot, 10.0 * now_s + 1.9) and exploration.due(robot, 10.0 * now_s + 2.0)
+            anew = exploration.decide(robot + (0.0, 0.5, 0.0), 10.0 * now_s + 2.0)
+            assert anew is not None and anew.candidate is None and anew.path[0, 1] > 1.4
+        exploration.arrived()
+    assert went == [False, False, True, True, False]

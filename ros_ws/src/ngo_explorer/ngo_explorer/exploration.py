@@ -22,6 +22,7 @@ _SAME_GOAL_M = 1.0  # a frontier that moves less than this from one decision to 
 _TRAIL_M = 1.0
 _PROGRESS_M = 0.2
 _OFF_PATH_M = 0.7
+_DETOUR_M = 1.0  # a new path to the same place that is longer by this is another one, with progress of its own
 _EXPLORE_LITE = (0.75, 30.0, 1.0 / 0.15)  # its smallest frontier, time without progress and time between decisions
 
 
@@ -76,7 +77,7 @@ class Exploration:
         self._may_forget = True
         self.deviation_m = -1.0
         self._revisits = Revisits(config.accurate_m) if accurate else None
-        self._went_back_for: Floats | None = None
+        self._went_back_for: list[Floats] = []
         self._trail: list[Floats] = []
         self._decided_s = -math.inf
         self._best_way_m, self._progress_s = math.inf, 0.0
@@ -102,11 +103,14 @@ class Exploration:
         """Whether it is time for a decision: there is no goal, it shows nothing new any more, or time has passed."""
         self._remember(robot_xyyaw[:2])
         goal = self.goal
-        if goal is None or goal.candidate is None:
-            return goal is None
-        if self._watch_progress(robot_xyyaw[:2], now_s) or self._off_path(robot_xyyaw[:2]):
+        if goal is None:
             return True
-        return now_s - self._decided_s >= self.config.replan_s or not self._still_frontier(goal.candidate.frontier)
+        if self.stands(robot_xyyaw[:2], now_s):
+            self.failed(f"no progress for {self.config.progress_s:g} s")
+            return True
+        if self._off_path(robot_xyyaw[:2]) or now_s - self._decided_s >= self.config.replan_s:
+            return True
+        return goal.candidate is not None and not self._still_frontier(goal.candidate.frontier)
 
     def decide(self, robot_xyyaw: Floats, now_s: float) -> Goal | None:
         """Choose where to drive now; None where no frontier is left that can be reached."""
@@ -114,6 +118,10 @@ class Exploration:
         self._remember(robot)
         if self._revisits is not None and self.deviation_m >= 0.0:
             self._revisits.note(robot, self.deviation_m)
+        if self.goal is not None and self.goal.candidate is None:
+            if self.go_to(robot_xyyaw, self.goal.pose_xyyaw, now_s) is not None:
+                return self.goal
+            self.goal = None
         self._decided_s = now_s
         before = self.goal.candidate if self.goal is not None else None
         field = cost_field(self.known, robot, self.need_m)
@@ -129,33 +137,58 @@ class Exploration:
                 if chosen != present:
                     self._best_way_m, self._progress_s = math.inf, now_s
                 goal = Goal(np.array((*candidate.viewpoint_xy, candidate.yaw)), path, candidate)
-                self.goal = self._revisit(robot_xyyaw, field, candidate) or goal
+                if self._revisit(robot_xyyaw, field, candidate, now_s) is None:
+                    self.goal = goal
                 return self.goal
             self._drop(candidate, "no path is wide enough")
         self.goal = None
         return None
 
-    def go_to(self, robot_xyyaw: Floats, pose_xyyaw: Floats) -> Goal | None:
-        """Drive to a place; None where no path leads there."""
+    def go_to(self, robot_xyyaw: Floats, pose_xyyaw: Floats, now_s: float) -> Goal | None:
+        """Drive to a place, or go on to it by a new path; None where no path leads there, and the goal stays."""
+        self._decided_s = now_s
         field = cost_field(self.known, robot_xyyaw[:2], self.need_m)
         path = plan_path(self.known, field, robot_xyyaw[:2], pose_xyyaw[:2], self.need_m)
-        self.goal = None if path is None else Goal(np.array(pose_xyyaw), path, None)
+        if path is None:
+            return None
+        way_m = len(path) * self.known.resolution_m
+        if self.goal is None or self.goal.candidate is not None:
+            self._best_way_m, self._progress_s = math.inf, now_s
+        elif way_m > self._best_way_m + _DETOUR_M:
+            self._best_way_m = way_m
+        self.goal = Goal(np.array(pose_xyyaw), path, None)
         return self.goal
 
-    def _revisit(self, robot_xyyaw: Floats, field: NDArray[np.int32], candidate: Candidate) -> Goal | None:
+    def turn_to(self, pose_xyyaw: Floats, now_s: float) -> None:
+        """Turn on the spot."""
+        self._best_way_m, self._progress_s, self._decided_s = math.inf, now_s, now_s
+        self.goal = Goal(pose_xyyaw, pose_xyyaw[None, :2], None)
+
+    def _revisit(
+        self, robot_xyyaw: Floats, field: NDArray[np.int32], candidate: Candidate, now_s: float
+    ) -> Goal | None:
         """The place to go back to before a candidate, once for each; None: it may go on."""
-        seen, before = candidate.frontier.point_xy, self._went_back_for
+        seen = candidate.frontier.point_xy
         if self._revisits is None or self.deviation_m < 0.0:
             return None
-        if before is not None and np.hypot(*(seen - before)) < _SAME_GOAL_M:
+        if any(np.hypot(*(seen - before)) < _SAME_GOAL_M for before in self._went_back_for):
             return None
         place = self._revisits.place(
             self.known, field, candidate.viewpoint_xy, candidate.way_m, self.deviation_m, self.need_m
         )
         if place is None:
             return None
-        self._went_back_for = seen
-        return self.go_to(robot_xyyaw, np.array((*place, robot_xyyaw[2])))
+        self._went_back_for.append(seen)
+        return self.go_to(robot_xyyaw, np.array((*place, robot_xyyaw[2])), now_s)
+
+    def stands(self, robot_xy: Floats, now_s: float) -> bool:
+        """Whether the robot has come no nearer to its goal for too long, along the path; turns do not count."""
+        assert self.goal is not None
+        nearest = int(np.argmin(np.sum((self.goal.path - robot_xy) ** 2, axis=1)))
+        left_m = (len(self.goal.path) - nearest) * self.known.resolution_m
+        if left_m < self._best_way_m - _PROGRESS_M:
+            self._best_way_m, self._progress_s = left_m, now_s
+        return now_s - self._progress_s >= self.config.progress_s
 
     def arrived(self) -> None:
         """The robot stands at the goal, and the map has what it sees: what is still unknown stays so from there."""
@@ -235,15 +268,3 @@ class Exploration:
         """Whether the path is elsewhere: the map has jumped, or somebody has carried the robot."""
         assert self.goal is not None
         return bool(np.sum((self.goal.path - robot_xy) ** 2, axis=1).min() > _OFF_PATH_M**2)
-
-    def _watch_progress(self, robot_xy: Floats, now_s: float) -> bool:
-        """Put the goal aside where the robot has come no nearer for too long; returns whether it did."""
-        assert self.goal is not None
-        nearest = int(np.argmin(np.sum((self.goal.path - robot_xy) ** 2, axis=1)))
-        left_m = (len(self.goal.path) - nearest) * self.known.resolution_m
-        if left_m < self._best_way_m - _PROGRESS_M:
-            self._best_way_m, self._progress_s = left_m, now_s
-        if now_s - self._progress_s < self.config.progress_s:
-            return False
-        self.failed(f"no progress for {self.config.progress_s:g} s")
-        return True

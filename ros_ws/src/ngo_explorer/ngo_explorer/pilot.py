@@ -7,7 +7,7 @@ from typing import Protocol
 
 import numpy as np
 
-from ngo_explorer.exploration import Exploration, Goal
+from ngo_explorer.exploration import Exploration, Goal, Left
 from ngo_explorer.known_map import Floats
 from ngo_explorer.path_follower import ARRIVED, STUCK
 
@@ -48,17 +48,16 @@ class Pilot:
         exploration = self.exploration
         if self.state == DONE or exploration.known.empty:
             return None
-        if exploration.goal is not None and self._driver.state == STUCK:
+        if self.state == RETURNING:
+            self._return(robot_xyyaw, now_s)
+        elif exploration.goal is not None and self._driver.state == STUCK:
             exploration.failed("the robot did not get there")
         elif exploration.goal is not None and self._driver.state == ARRIVED and self._settled(now_s):
             self._waits = None
             exploration.arrived()
         elif exploration.goal is not None and self._driver.state == ARRIVED and exploration.goal.candidate is None:
             exploration.arrived()
-        if self.state == RETURNING:
-            if exploration.goal is None:
-                self._end()
-        elif exploration.due(robot_xyyaw, now_s):
+        if self.state == EXPLORING and exploration.due(robot_xyyaw, now_s):
             self._decide(robot_xyyaw, now_s)
         return exploration.goal
 
@@ -68,7 +67,8 @@ class Pilot:
         if goal is None:
             self._look_or_finish(robot_xyyaw, now_s)
             return
-        self._waits, self._looks_left = None, _LOOKS
+        if goal.candidate is not None:
+            self._waits, self._looks_left = None, _LOOKS
         self._driver.follow(goal.path, float(goal.pose_xyyaw[2]), new=_other(before, goal))
 
     def _look_or_finish(self, robot_xyyaw: Floats, now_s: float) -> None:
@@ -76,12 +76,13 @@ class Pilot:
         if self._looks_left > 0:
             self._looks_left -= 1
             pose = robot_xyyaw + (0.0, 0.0, math.tau / _LOOKS)
-            self.exploration.goal = Goal(pose, pose[None, :2], None)
+            self.exploration.turn_to(pose, now_s)
             self._driver.follow(pose[None, :2], float(pose[2]), new=True)
             return
         self._driver.stop()
         if self._settled(now_s) and not self.exploration.another_chance():
-            self._finish(robot_xyyaw)
+            self.state = RETURNING
+            self._return(robot_xyyaw, now_s)
 
     def _settled(self, now_s: float) -> bool:
         changes = self.exploration.known.changes
@@ -90,17 +91,25 @@ class Pilot:
         since_s, before = self._waits
         return now_s - since_s >= self._settle_s or (changes > before and now_s - since_s >= 0.5 * self._settle_s)
 
-    def _finish(self, robot_xyyaw: Floats) -> None:
-        self.exploration.goal = None
-        goal = None if self._home is None else self.exploration.go_to(robot_xyyaw, self._home)
-        if goal is None:
+    def _return(self, robot_xyyaw: Floats, now_s: float) -> None:
+        """Drive home, planned anew in its turn. While no path leads there the last one stays: what bars it may go."""
+        exploration, home, new = self.exploration, self._home, self.exploration.goal is None
+        if home is None or (not new and self._driver.state == ARRIVED):
             self._end()
-            return
-        self.state = RETURNING
-        self._driver.follow(goal.path, float(goal.pose_xyyaw[2]), new=True)
+        elif not new and exploration.stands(robot_xyyaw[:2], now_s):
+            self._end(Left(home[:2], "the robot did not get back to the start"))
+        elif new or exploration.due(robot_xyyaw, now_s):
+            goal = exploration.go_to(robot_xyyaw, home, now_s)
+            if goal is None and exploration.known.forget_marks():
+                goal = exploration.go_to(robot_xyyaw, home, now_s)
+            if goal is not None:
+                self._driver.follow(goal.path, float(goal.pose_xyyaw[2]), new)
+            elif new:
+                self._end(Left(home[:2], "no path leads back to the start"))
 
-    def _end(self) -> None:
-        self.state = DONE
+    def _end(self, *left: Left) -> None:
+        self.state, self.exploration.goal = DONE, None
+        self.exploration.unreachable = [*self.exploration.unreachable, *left]
         self._driver.stop()
 
 
