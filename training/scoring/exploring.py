@@ -126,7 +126,7 @@ def explore(
     """
     run = _Run(world, seen, estimator)
     exploration = Exploration(config, seed=seed, accurate=accurate)
-    run.drive(exploration, PathFollower(drive, run.need_m(config), config.touch_m), most_s)
+    run.drive(exploration, PathFollower(drive, config), most_s)
     return run.explored()
 
 
@@ -137,8 +137,8 @@ def drive_known_tour(
     run = _Run(world, seen)
     known = KnownMap(config.radius_m, config.comfort_m)
     known.update(seen.map.values, RESOLUTION_M, seen.map.origin_xy)
-    follower = PathFollower(drive, run.need_m(config), config.touch_m)
-    for path in known_tour(world, known, run.sight.pose_xyyaw[:2], run.need_m(config)):
+    follower = PathFollower(drive, config)
+    for path in known_tour(world, known, run.sight.pose_xyyaw[:2], config.need_m(RESOLUTION_M)):
         follower.follow(path, float(np.arctan2(*(path[-1] - path[max(0, len(path) - 5)])[::-1])))
         while follower.state == DRIVING and run.sight.time_s < most_s:
             run.look()
@@ -180,10 +180,6 @@ class _Run:
         """Let the follower have the newest scan."""
         scan = self.sight.scan
         follower.look(scan.ends[scan.hits].astype(np.float64), self.sight.time_s)
-
-    def need_m(self, config: ExplorerConfig) -> float:
-        """Clearance that the robot's middle needs."""
-        return config.radius_m + config.margin_m + 0.5 * RESOLUTION_M
 
     def drive(self, exploration: Exploration, follower: PathFollower, most_s: float) -> None:
         """Explore until nothing is left. Decisions are timed by the time of this process, on one core."""

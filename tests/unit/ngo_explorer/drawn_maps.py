@@ -40,9 +40,10 @@ def explore(
 
     glass: what its scans show nearby, beside what the map has.
     """
-    exploration = Exploration(config or ExplorerConfig(radius_m=0.2), boundary)
+    config = config or ExplorerConfig(radius_m=0.2)
+    exploration = Exploration(config, boundary)
     known = np.full_like(truth, -1)
-    follower = PathFollower(DriveConfig(), 0.3, 0.225)
+    follower = PathFollower(DriveConfig(), config)
     pilot, robot, way = Pilot(exploration, follower, 0.5, None), np.array((*start_xy, 0.0)), []
     for step in range(6000):
         if step % 5 == 0:

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from ngo_explorer.exploration import Exploration
+from ngo_explorer.known_map import KnownMap
 from ngo_explorer.path_follower import ARRIVED, DRIVING, STUCK, PathFollower
 from ngo_explorer.pilot import DONE, RETURNING, Pilot
 from ngo_explorer.settings import RULES, DriveConfig, ExplorerConfig
@@ -154,7 +155,7 @@ class Nobody:
 @pytest.mark.parametrize(("closed", "drives"), [(1, True), (2, True), (0, False)])
 def test_the_way_home_is_planned_anew_and_a_robot_that_does_not_get_there_says_so(closed: int, drives: bool) -> None:
     exploration, robot, truth = Exploration(ExplorerConfig(radius_m=0.2)), np.array((1.5, 1.5, 0.0)), RING.copy()
-    driver = PathFollower(DriveConfig(), 0.3, 0.225) if drives else Nobody()
+    driver = PathFollower(DriveConfig(), exploration.config) if drives else Nobody()
     pilot, begun_s = Pilot(exploration, driver, 0.5, HOME), math.inf
     for step in range(1500):
         exploration.known.update(truth, RESOLUTION_M, np.zeros(2))
@@ -186,7 +187,7 @@ def test_a_robot_that_does_not_move_backs_up_and_is_stuck_at_last() -> None:
     exploration, _, robot = looking(ExplorerConfig(radius_m=0.2))
     goal = exploration.decide(robot, 0.0)
     assert goal is not None
-    follower = PathFollower(DriveConfig(stuck_s=1.0), exploration.need_m, 0.22)
+    follower = PathFollower(DriveConfig(stuck_s=1.0), exploration.config)
     follower.follow(goal.path, 0.0)
     robot[2] = math.atan2(*(goal.path[5] - goal.path[0])[::-1])
     speeds = []
@@ -205,7 +206,7 @@ def test_poses_that_come_late_change_nothing_where_the_robot_moves_as_it_is_told
     assert goal is not None
     ways = []
     for late in (0, 3):
-        follower, way = PathFollower(DriveConfig(), exploration.need_m, 0.22), [start] * (late + 1)
+        follower, way = PathFollower(DriveConfig(), exploration.config), [start] * (late + 1)
         follower.follow(goal.path, 0.0)
         for step in range(60):
             speed, turn_rate = follower.step(exploration.known, way[-1 - late], 0.1 * step, 0.1 * late)
@@ -236,9 +237,45 @@ def test_what_the_scan_shows_stops_it_unless_it_is_far_or_the_robot_itself(away_
     goal = exploration.decide(robot, 0.0)
     assert goal is not None
     robot[2] = math.atan2(*(goal.path[5] - goal.path[0])[::-1])
-    follower = PathFollower(DriveConfig(), exploration.need_m, 0.22)
+    follower = PathFollower(DriveConfig(), exploration.config)
     follower.follow(goal.path, 0.0)
-    for step in range(5):
-        follower.look(np.array(((away_m, -0.02), (away_m, 0.02))), 0.1 * step)
+    for step in range(30):
+        if step < 5:
+            follower.look(np.array(((away_m, -0.02), (away_m, 0.02))), 0.1 * step)
         speed, _ = follower.step(exploration.known, robot, 0.1 * step)
-    assert (speed > 0.1) == drives
+        if drives and speed > 0.1:
+            break
+    assert (speed > 0.1) == drives, "a scanner that falls silent leaves what it saw"
+
+
+@pytest.mark.parametrize("speed_mps", [0.9, 2.5])
+def test_what_only_the_scan_shows_is_far_enough_to_stop_at_any_speed(speed_mps: float) -> None:
+    known, x, speed = KnownMap(0.2, 0.6), 2.0, 0.0
+    known.update(np.pad(np.zeros((18, 298), np.int8), 1, constant_values=100), RESOLUTION_M, np.zeros(2))
+    config = DriveConfig(speed_mps=speed_mps, acceleration_mps2=0.5)
+    follower = PathFollower(config, ExplorerConfig(radius_m=0.2))
+    follower.follow(np.column_stack((np.arange(2.0, 28.0, 0.1), np.full(260, 1.0))), 0.0)
+    fastest = farthest = 0.0
+    for step in range(600):
+        follower.look(np.column_stack((np.full(11, 20.0 - x), np.linspace(-0.5, 0.5, 11))), 0.05 * step)
+        wanted, _ = follower.step(known, np.array((x, 1.0, 0.0)), 0.05 * step)
+        fastest, speed = max(fastest, wanted), max(wanted, speed - 0.025)  # the base brakes as it can
+        x += 0.05 * speed
+        farthest = max(farthest, x)
+    assert fastest == pytest.approx(speed_mps) and 19.0 < farthest < 19.8
+
+
+def test_a_robot_that_was_halted_begins_slowly() -> None:
+    known = KnownMap(0.2, 0.6)
+    known.update(np.pad(np.zeros((18, 98), np.int8), 1, constant_values=100), RESOLUTION_M, np.zeros(2))
+    follower, path = (
+        PathFollower(DriveConfig(), ExplorerConfig(radius_m=0.2)),
+        np.array(((2.0, 1.0), (2.7, 1.0), (9.0, 1.0))),
+    )
+    speeds = []
+    for step in range(40):
+        if step % 20 == 0:
+            follower.stop()
+            follower.follow(path, 0.0)
+        speeds.append(follower.step(known, np.array((2.0, 1.0, 0.0)), 0.1 * step + (step >= 20) * 60.0)[0])
+    assert speeds[19] > 0.4 and speeds[20] <= 0.05 and speeds[21] <= 0.1

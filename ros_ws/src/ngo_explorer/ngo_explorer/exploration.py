@@ -85,8 +85,7 @@ class Exploration:
     @property
     def need_m(self) -> float:
         """Clearance that a cell needs for the robot's middle."""
-        # Two points in cells may be nearer than the cells' middles by a cell's diagonal; half of it is usual.
-        return self.config.radius_m + self.config.margin_m + 0.5 * self.known.resolution_m
+        return self.config.need_m(self.known.resolution_m)
 
     @property
     def area_m2(self) -> float:

@@ -8,14 +8,14 @@ import numpy as np
 
 from ngo_explorer.known_map import Floats, KnownMap
 from ngo_explorer.planner import line_is_free
-from ngo_explorer.settings import DriveConfig
+from ngo_explorer.settings import DriveConfig, ExplorerConfig
 
 _LOOKAHEAD_M = (0.35, 0.8)  # at rest and at 1 m/s
 _TURN_ON_THE_SPOT_RAD = 0.8
 _FACES_RAD = 0.3  # near enough to the goal's direction
 _BACK_M, _BACK_MPS = 0.3, 0.1
 _MOVED_M, _MOVED_RAD = 0.03, 0.1
-_SEEN_M = 1.0  # hits of a scan that are nearer may stop the robot
+_SPARE_M = 0.3  # beyond the way until the robot could stop, up to which hits of a scan are kept
 _KEPT_S = 2.0  # poses come no later than this
 _MOST_TRIES = 3  # to come free, before the goal is given up
 
@@ -28,9 +28,10 @@ class PathFollower:
     ``state`` is DRIVING, ARRIVED at the goal, or STUCK: it backed up several times in vain.
     """
 
-    def __init__(self, config: DriveConfig, need_m: float, touch_m: float) -> None:
-        """need_m: clearance that the robot's middle needs in the map. touch_m: from what its newest scan shows."""
-        self.config, self._need_m, self._touch_m = config, need_m, touch_m
+    def __init__(self, config: DriveConfig, robot: ExplorerConfig) -> None:
+        """robot: how near its middle may come to what the map has, and to what its newest scan shows."""
+        self.config, self._robot, self._touch_m, self._need_m = config, robot, robot.touch_m, 0.0
+        self._seen_m = self._touch_m + config.speed_mps * self._stop_s(config.speed_mps) + _SPARE_M
         self.state = ARRIVED
         self._path, self._goal_yaw = np.zeros((0, 2)), 0.0
         self._speed = self._turn_rate = 0.0
@@ -38,7 +39,7 @@ class PathFollower:
         self._tries, self._back_left_m = 0, 0.0
         self._moved_at: tuple[Floats, float] | None = None
         self._last_s: float | None = None
-        self._hits, self._hits_s = np.zeros((0, 2)), 0.0
+        self._hits, self._hits_s = np.zeros((0, 2)), math.inf
         self._sent: list[tuple[float, float, float]] = []  # times, speeds and turn rates, those of the last seconds
 
     def follow(self, path: Floats, yaw: float, new: bool = True) -> None:
@@ -50,6 +51,8 @@ class PathFollower:
     def stop(self) -> None:
         """Give the path up; the robot brakes. What moves it until the next step is not known."""
         self._path, self.state, self._sent = np.zeros((0, 2)), ARRIVED, []
+        self._speed = self._turn_rate = self._back_left_m = 0.0
+        self._last_s = None
 
     def look(self, hits_xy: Floats, seen_s: float) -> None:
         """Take the hits ``(n, 2)`` of the newest scan, in the robot's frame when it was taken.
@@ -58,13 +61,14 @@ class PathFollower:
         """
         away_m = np.hypot(*hits_xy.T)
         # What is far inside the robot is the robot itself.
-        self._hits, self._hits_s = hits_xy[(away_m > 0.8 * self._touch_m) & (away_m < _SEEN_M)], seen_s
+        self._hits, self._hits_s = hits_xy[(away_m > 0.8 * self._touch_m) & (away_m < self._seen_m)], seen_s
 
     def step(self, known: KnownMap, robot_xyyaw: Floats, now_s: float, late_s: float = 0.0) -> tuple[float, float]:
         """Speed (m/s) and turn rate (rad/s) from now on; call it at a steady pace.
 
         robot_xyyaw: where the robot was ``late_s`` ago. Since then it has moved as it was told.
         """
+        self._need_m = self._robot.need_m(known.resolution_m)
         robot_xyyaw = self._moved_on(robot_xyyaw, now_s - late_s, now_s)
         period_s = 0.0 if self._last_s is None else min(0.5, max(0.0, now_s - self._last_s))
         self._last_s = now_s
@@ -80,7 +84,7 @@ class PathFollower:
             known.mark(_placed(robot_xyyaw, self._hits_now(now_s)))
         turning = config.turn_acceleration_rps2 * period_s
         self._turn_rate = turn_rate if turn_rate == 0.0 else _towards(turn_rate, self._turn_rate, turning)
-        self._sent = [sent for sent in self._sent if sent[0] > now_s - _KEPT_S]
+        self._sent = [sent for sent in self._sent if sent[0] > min(now_s, self._hits_s) - _KEPT_S]
         self._sent.append((now_s, self._speed, self._turn_rate))
         return self._speed, self._turn_rate
 
@@ -151,11 +155,16 @@ class PathFollower:
         return True
 
     def _ahead(self, speed: float, turn_rate: float) -> Floats:
-        """Points ``(4, 2)`` of the way until it could stop, half a second on, in the robot's frame."""
-        stop_s = 0.5 + abs(speed) / (2.0 * self.config.acceleration_mps2)
-        times = stop_s * np.arange(1, 5) / 4
+        """Points ``(n, 2)`` of the way until it could stop, half a second on, in the robot's frame."""
+        stop_s = self._stop_s(speed)
+        # No farther apart than what the robot sweeps at each of them.
+        count = max(4, math.ceil(abs(speed) * stop_s / self._touch_m))
+        times = stop_s * np.arange(1, count + 1) / count
         headings = turn_rate * times / 2
         return np.column_stack((speed * times * np.cos(headings), speed * times * np.sin(headings)))
+
+    def _stop_s(self, speed: float) -> float:
+        return 0.5 + abs(speed) / (2.0 * self.config.acceleration_mps2)
 
     def _would_touch(self, now_s: float) -> bool:
         """Whether the way until it could stop comes nearer to two hits of the newest scan; one alone may be noise."""
@@ -167,9 +176,7 @@ class PathFollower:
         return bool(np.any(gaps[1:] < min(self._touch_m, gaps[0] - 0.01)))
 
     def _hits_now(self, now_s: float) -> Floats:
-        """The hits in the robot's frame of now: it has moved on. Those of a scanner that has fallen silent are gone."""
-        if now_s - self._hits_s > _KEPT_S:
-            return np.zeros((0, 2))
+        """The hits in the robot's frame of now: it has moved on."""
         moved = self._moved_on(np.zeros(3), self._hits_s, now_s)
         cos, sin = math.cos(moved[2]), math.sin(moved[2])
         return np.asarray((self._hits - moved[:2]) @ np.array(((cos, -sin), (sin, cos))))

@@ -35,6 +35,11 @@ class ExplorerConfig(Settings):
     )
     progress_s: float = setting(15.0, "Time without progress after which a goal is put aside, s.", minimum=1.0)
 
+    def need_m(self, resolution_m: float) -> float:
+        """Clearance that a cell of a map needs for the robot's middle."""
+        # Two points in cells may be nearer than the cells' middles by a cell's diagonal; half of it is usual.
+        return self.radius_m + self.margin_m + 0.5 * resolution_m
+
     @property
     def touch_m(self) -> float:
         """Distance from what a scan shows at which the robot stops: half of the margin is left."""

@@ -15,7 +15,7 @@ def warm_up() -> None:
     values[5:25, :20] = values[5:25, 180:] = -1
     exploration = Exploration(ExplorerConfig())
     exploration.known.update(values, 0.1, np.zeros(2))
-    follower = PathFollower(DriveConfig(), exploration.need_m, exploration.config.touch_m)
+    follower = PathFollower(DriveConfig(), exploration.config)
     pilot, robot = Pilot(exploration, follower, 1.0, None), np.array((10.0, 1.5, 0.0))
     for step in range(3):
         pilot.step(robot, 3.0 * step)

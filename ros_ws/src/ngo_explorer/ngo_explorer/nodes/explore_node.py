@@ -81,7 +81,7 @@ class ExploreNode(Node):
 
     def _make_driver(self, settings: ExploreNodeSettings) -> PathFollower | Nav2Driver | PublishedGoals:
         if settings.drive == "own":
-            return PathFollower(self._drive, self._config.radius_m + self._config.margin_m, self._config.touch_m)
+            return PathFollower(self._drive, self._config)
         if settings.drive == "nav2":
             return Nav2Driver(self, settings.navigate_action, settings.nav2_timeout_s, self._pose_message)
         return PublishedGoals()
