@@ -11,7 +11,7 @@ from ngo_sim.floor_plans import FloorPlanConfig
 from ngo_sim.lidar import cast_scans, ray_world
 from training.data.building_drives import lidar_drive
 from training.data.fleet_drives import patrol_scanner
-from training.data.lidar_drives import LidarDrive
+from training.data.lidar_drives import LidarDrive, simulated_stamps_ns
 
 _FAR_M = 100_000.0
 
@@ -23,8 +23,10 @@ class YearDrive:
     measured: LidarDrive
     building: BuildingDrive
 
-    def exact_scans(self, poses_xyyaw: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """What a scanner without errors would see from poses ``(n, 3)`` as the building is at the end, without people.
+    def exact_scans(self, stamps_ns: np.ndarray, poses_xyyaw: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """What a scanner without errors would see of the building as it is now from poses ``(n, 3)``, without people.
+
+        Doors are as they were at the stamps ``(n,)``: they decide on what is seen, and not on what is there.
 
         Returns directions ``(rays,)`` from the robot, ranges ``(n, rays)`` and the scanner's pose ``(3,)`` on the
         robot. It sees through glass.
@@ -37,7 +39,7 @@ class YearDrive:
         swing = np.column_stack((plan.doors.hinges_m, plan.doors.widths_m))
         world = ray_world(plan.segments_m, plan.glass, plan.circles_m, swing)
         count = len(poses_xyyaw)
-        leaves = np.repeat(plan.doors.leaves(drive.stamps_s[-1:]), count, axis=0)
+        leaves = plan.doors.leaves(1e-9 * (stamps_ns - simulated_stamps_ns(np.zeros(1))))
         nobody, rng = np.zeros((count, 0, 3)), np.random.default_rng(0)
         ranges = cast_scans(world, scanner, poses_xyyaw, np.zeros((count, 2)), leaves, nobody, rng)
         at = np.array((scanner.laser_x_m, scanner.laser_y_m, 0.0))

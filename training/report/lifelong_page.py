@@ -53,8 +53,8 @@ with `map_changes:=learn`. From {settings[most_scans]} key scans on, old ones le
 - Error: root mean square distance of the drive's positions, from where the robot was found on, after the best rigid
   motion. A drive in which the robot was never found has none.
 - IoU: of the cells of `/map` with those that exact rays from the true poses of its scans see in the building as it is
-  at the end of the drive. Cells have 5 cm: of the thin lines of occupied ones noise alone makes many differ; and a door
-  that has moved since shows or hides what is behind it. Where all scans count alike, older ones are not bounded.
+  at the end of the drive, with each door as it was at the scan. Cells have 5 cm: of the thin lines of occupied ones
+  noise alone makes many differ. Where all scans count alike, older ones are not bounded.
 - Localised: from {settings[starts]} starts in a drive, if the map shows the way there: a pose within 0.5 m and 5
   degrees is claimed within 50 scans, or 300. False claims: wrong ones there, and where the drive itself was found.
 - Time a scan: computing time of odometry and correction; that of the map, drawn every 5 s, comes on top. Memory: all

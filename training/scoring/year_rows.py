@@ -240,7 +240,7 @@ class _Drive:
 
     def _map_errors(self, numbers: dict[str, float]) -> dict[str, np.ndarray]:
         """Compare the map with what exact scans from the same true poses show of the building as it is now."""
-        angles, ranges, sensor = self._drive.exact_scans(self._known.poses_xyyaw)
+        angles, ranges, sensor = self._drive.exact_scans(self._known.stamps_ns, self._known.poses_xyyaw)
         most_m = self._drive.building.scanner.range_max_m
         scans = [range_scan(angles, seen.astype(np.float64), sensor, most_m) for seen in ranges]
         grid, config = OccupancyGrid(self._map.resolution_m), self._map.config.occupancy
