@@ -3,9 +3,8 @@
 import numpy as np
 
 from ngo_estimator.loops.key_scan_views import KeyScanViews
-from ngo_estimator.loops.place_evidence import PlaceEvidence
 from ngo_estimator.loops.scan_settings import ScanLoopConfig
-from ngo_estimator.slam.alike_places import alike_share
+from ngo_estimator.slam.alike_places import MOST_ALIKE, alike_share
 from tests.unit.ngo_estimator.loops.buildings import HALLWAY, ROUND, outline, scan_at, way
 
 ROOM = np.concatenate(
@@ -19,19 +18,15 @@ ROOM = np.concatenate(
 IN_AND_OUT = ((0.5, 1), (2.5, 1), (2.5, 4.2), (2.5, 1))
 
 
-def enough(found: PlaceEvidence) -> bool:
-    return found.walls >= 8 and found.mean < 0.15
-
-
 def share(walls: np.ndarray, poses: np.ndarray) -> float:
     random = np.random.default_rng(0)
     scans = [scan_at(walls, pose, random) for pose in poses]
     views = KeyScanViews().of_map(scans)
-    return alike_share(np.arange(len(poses)), scans, views, poses, ScanLoopConfig(), enough)
+    return alike_share(np.arange(len(poses)), scans, views, poses, ScanLoopConfig())
 
 
 def test_rooms_that_look_alike_are_noticed_and_corners_of_a_ring_are_told_apart() -> None:
     rooms = np.concatenate([ROOM + (x, 0, x, 0) for x in (0, 7, 14)])
     through = way(*[(x + dx, y) for x in (0, 7, 14) for dx, y in IN_AND_OUT])
-    assert share(rooms, through) > 0.3
-    assert share(HALLWAY, way(*ROUND, ROUND[0])) < 0.15
+    assert share(rooms, through) > MOST_ALIKE
+    assert share(HALLWAY, way(*ROUND, ROUND[0])) < MOST_ALIKE

@@ -35,6 +35,10 @@ _MOST_POINTS = 2000
 _SAID = 40
 """Sightings from which on their share says something."""
 
+_LEAST_WALLS, _MOST_MEAN, MOST_THROUGH = 8, 0.15, 0.33
+"""A claim needs so many different walls. The way may look through so much of the walls in the mean, and each of its
+parts through so much at most."""
+
 
 @dataclass(frozen=True)
 class PlaceEvidence:
@@ -52,6 +56,11 @@ class PlaceEvidence:
     seen: int = 0
     mean: float = 0.0
     overlap: float = 0.0
+
+    @property
+    def suffices(self) -> bool:
+        """Whether a stretch of the way and a place have enough in common, and contradict each other little."""
+        return self.walls >= _LEAST_WALLS and self.mean <= _MOST_MEAN and self.through <= MOST_THROUGH
 
 
 NO_EVIDENCE = PlaceEvidence(0, 0.0, 0)

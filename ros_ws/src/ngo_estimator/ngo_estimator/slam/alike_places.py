@@ -4,14 +4,14 @@ Two robots that have been in one room each cannot know whether it is the same ro
 knows whether rooms are alike here: the evidence for a claim is asked about places that are certainly others.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 
 from ngo_estimator.geometry import se2
 from ngo_estimator.geometry.key_scan import KeyScan
 from ngo_estimator.loops.key_scan_views import KeyScanViews
-from ngo_estimator.loops.place_evidence import PlaceEvidence, evidence_of, last_stretch
+from ngo_estimator.loops.place_evidence import evidence_of, last_stretch
 from ngo_estimator.loops.scan_settings import ScanLoopConfig
 from ngo_estimator.loops.scan_submaps import laid_together
 from ngo_estimator.slam.evidence import elsewhere
@@ -23,6 +23,9 @@ _LOOKS = 24
 _REACH_M = 2.0
 """How far a place is from the way."""
 
+MOST_ALIKE = 0.1
+"""Where a larger share of places is alike, what looks the same may be another place."""
+
 
 def alike_share(
     keys: np.ndarray,
@@ -30,14 +33,12 @@ def alike_share(
     views: KeyScanViews,
     poses: np.ndarray,
     config: ScanLoopConfig,
-    suffices: Callable[[PlaceEvidence], bool],
 ) -> float:
     """The share of places on a way for which the evidence would suffice at another place of the way, too.
 
     Args:
         keys: the way's key scans ``(n,)``, one after another, whose poses are sure of each other.
         scans, views, poses: of all key scans, poses ``(keys, 3)``.
-        suffices: whether evidence is enough to claim a place.
     """
     before = config.source_keys - 1
     chosen = [scans[key] for key in keys.tolist()]
@@ -52,7 +53,7 @@ def alike_share(
         since = se2.between(poses[key], poses[stretch])
         others = (se2.compose(pose, since) for pose in seen[elsewhere(seen, poses[key], matcher.place_m)])
         return any(
-            suffices(evidence_of(scans, views, (stretch, at), (keys, poses[keys]), count_walls=True)) for at in others
+            evidence_of(scans, views, (stretch, at), (keys, poses[keys]), count_walls=True).suffices for at in others
         )
 
     looks = np.unique(np.linspace(keys[before], keys[-1], _LOOKS).astype(np.int64))

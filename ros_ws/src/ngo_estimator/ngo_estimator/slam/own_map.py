@@ -20,11 +20,11 @@ from ngo_estimator.geometry.planar_motion import between, compose, turned_covari
 from ngo_estimator.graph.pose_graph import PoseGraph
 from ngo_estimator.graph.segments import segment_of
 from ngo_estimator.loops.key_scan_views import KeyScanViews
-from ngo_estimator.loops.place_evidence import PlaceEvidence, evidence_of, last_stretch
+from ngo_estimator.loops.place_evidence import MOST_THROUGH, PlaceEvidence, evidence_of, last_stretch
 from ngo_estimator.loops.scan_loops import EVIDENCE, ScanLoops
 from ngo_estimator.loops.scan_settings import ScanGraphConfig
 from ngo_estimator.loops.scan_submaps import laid_together
-from ngo_estimator.slam.alike_places import alike_share
+from ngo_estimator.slam.alike_places import MOST_ALIKE, alike_share
 from ngo_estimator.slam.evidence import HypothesisWindow, agreeing, fused, strongest_modes
 from ngo_estimator.slam.localisation import LocalisationConfig, may_claim
 from ngo_estimator.slam.scan_matcher import ScanMatcher
@@ -36,12 +36,8 @@ _REACH_M = 2.0
 _GROWN = 1.1
 """The map is laid out anew when so many times as many key scans are to be searched."""
 
-_LEAST_WALLS, _MOST_MEAN, _MOST_THROUGH = 8, 0.15, 0.33
-"""A claim needs so many different walls. The way may look through so much of the walls in the mean, and each of its
-parts through so much at most."""
-
-_WAY_KEYS, _MOST_ALIKE = 400, 0.1
-"""Where of a way's last so many key scans more than this share is alike, what looks the same may be another place."""
+_WAY_KEYS = 400
+"""Of a way's last so many key scans is asked whether places look alike there."""
 
 _TRIAL_LOOKS, _CONTRADICTIONS = 40, 3
 """Looks after a claim in which the newest scans may still contradict it, and how many in a row do."""
@@ -127,8 +123,7 @@ class OwnMap:
             return ScanLoops.none()
         agree = agreeing(hypotheses, modes[0].pose_xyyaw, modes[0].covariance, place_m)
         pose, _ = fused(hypotheses.where(agree), modes[0].pose_xyyaw)
-        evidence = self._evidence(pose, scans, views, graph)
-        if not _suffices(evidence):
+        if not self._evidence(pose, scans, views, graph).suffices:
             return ScanLoops.none()
         if self._is_ambiguous(int(self._keys[_nearest(self._poses, pose[None])[0]]), scans, views, graph):
             self._forget_looks()
@@ -152,7 +147,7 @@ class OwnMap:
         ends = np.append(graph.segments, len(graph))
         for segment in (segment_of(graph.segments, np.array(there)), len(graph.segments) - 1):
             way = np.arange(max(ends[segment], ends[segment + 1] - _WAY_KEYS), ends[segment + 1])
-            if alike_share(way, scans, views, graph.poses, self._config.loops, _suffices) > _MOST_ALIKE:
+            if alike_share(way, scans, views, graph.poses, self._config.loops) > MOST_ALIKE:
                 return True
         return False
 
@@ -169,7 +164,7 @@ class OwnMap:
         found = evidence_of(scans, views, (last, graph.poses[last]), (others, graph.poses[others]))
         if found.said:
             self._trial -= 1
-            self._against = self._against + 1 if found.through > _MOST_THROUGH else 0
+            self._against = self._against + 1 if found.through > MOST_THROUGH else 0
         if self._against < _CONTRADICTIONS:
             return False
         self._trial = self._against = 0
@@ -280,11 +275,6 @@ class OwnMap:
         """Raise ``StateError`` about restored arrays that do not belong together."""
         require(len(self.looks) == len(self._window), f"{len(self._window)} looks are not of as many key scans")
         require(len(self._keys) == len(self._poses), f"{len(self._keys)} key scans do not have as many poses")
-
-
-def _suffices(evidence: PlaceEvidence) -> bool:
-    """Whether a stretch of the way and a place have enough in common, and contradict each other little."""
-    return evidence.walls >= _LEAST_WALLS and evidence.mean <= _MOST_MEAN and evidence.through <= _MOST_THROUGH
 
 
 def _nearest(poses: np.ndarray, others: np.ndarray) -> np.ndarray:
