@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+import rclpy
 from geometry_msgs.msg import PoseWithCovarianceStamped
 from ngo_msgs.msg import RelativePose, Trajectory
 from ngo_msgs.srv import LoadState, Reset, SaveState
@@ -19,6 +20,7 @@ from tf2_msgs.msg import TFMessage
 from ngo_estimator.frontend.camera.local_odometry import LocalOdometry
 from ngo_estimator.geometry.planar_motion import between, compose
 from ngo_estimator.nodes.messages import pose_message, relative_pose_message, to_ns
+from ngo_estimator.nodes.ngo_node import NgoNode
 from tests.golden.drives import WEIGHTS, GoldenDrive, estimates
 
 from .processes import NodeProcess, Probe
@@ -169,6 +171,42 @@ def test_a_map_that_learns_grows_from_where_the_robot_is_and_outlives_a_reset(ma
         process.send(signal.SIGINT)
         assert process.wait() == 0, process.log
         assert "Traceback" not in process.log, process.log
+
+
+@pytest.fixture
+def learning(mapped: Mapped) -> Iterator[NgoNode]:
+    """A node of this process in a map that learns, which has found its robot."""
+    parameters = {**mapped.parameters, "mode": "localization", "map_changes": "learn", "state": "maze"}
+    rclpy.init(args=["--ros-args", *(word for item in parameters.items() for word in ("-p", "{}:={}".format(*item)))])
+    node = NgoNode().start()
+    for message in mapped.steps:
+        node._on_relative_pose(_later(message, 3))
+    assert node._search is None and node._core.newest().frames > mapped.frames
+    yield node
+    node.destroy_node()
+    rclpy.try_shutdown()
+
+
+def test_a_map_is_finished_before_the_robot_is_looked_for_again_and_moves_no_more(
+    learning: NgoNode, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    done: list[str] = []
+    monkeypatch.setattr(learning._core, "finish", lambda: done.append("finished"))
+    monkeypatch.setattr(learning._out, "send_transform", lambda *_: done.append("sent"))
+    learning._on_reset(Reset.Request(), Reset.Response())
+    learning._finish()  # the timer
+    assert done == ["finished"]
+
+
+def test_a_core_that_failed_gives_way_to_the_saved_map(
+    mapped: Mapped, learning: NgoNode, capfd: pytest.CaptureFixture[str]
+) -> None:
+    learning._core._log = None  # type: ignore[assignment]
+    learning._on_relative_pose(_later(mapped.steps[-1], 4))
+    assert "internal error, the saved map is loaded again" in "".join(capfd.readouterr())
+    assert learning._search is not None and learning._core.newest().frames == mapped.frames
+    learning._on_relative_pose(_later(mapped.steps[0], 5))
+    assert "internal error" not in "".join(capfd.readouterr())
 
 
 def test_a_robot_says_that_it_is_not_localised_until_its_pose_is_known_and_right(again: Again) -> None:

@@ -52,6 +52,7 @@ class FileServices:
         """
         self._node, self._settings, self._folder = node, settings, Path(settings.save_directory)
         self._trajectory, self._graph, self._session, self._take = trajectory, graph, session, take
+        self._newest = self._folder  # the state that was loaded or saved last
 
     def open(self, qos: QoSProfile, built: ExitStack) -> None:
         """Offer the services, until ``built`` is closed."""
@@ -69,8 +70,12 @@ class FileServices:
 
     def load_at_start(self, path: str, relocalise: bool) -> None:
         """Load the state in a folder that the parameters name; raises ``ValueError``, of one line."""
-        folder = self._folder.expanduser() / Path(path).expanduser()
-        self._take(self._loaded(self._session(), folder, relocalise))
+        self._newest = self._folder.expanduser() / Path(path).expanduser()
+        self._take(self._loaded(self._session(), self._newest, relocalise))
+
+    def load_again(self) -> None:
+        """Load the state that was loaded or saved last, and look for the robot in it; raises ``ValueError``."""
+        self._take(self._loaded(self._session(), self._newest, relocalise=True))
 
     def _loaded(self, present: "Session", folder: Path, relocalise: bool) -> "Loaded":
         session = present.loaded(folder)
@@ -99,6 +104,7 @@ class FileServices:
             arrays, frames = session.state(), session.core.newest().frames
             path = folder_inside(self._folder, request.path)
             await self._aside(lambda: session.write(path, arrays))
+            self._newest = path
             response.success, response.message = True, f"wrote {frames} poses to {path}"
         except ValueError as error:
             response.message = str(error)
@@ -111,6 +117,7 @@ class FileServices:
             path, present = folder_inside(self._folder, request.path), self._session()
             loaded = await self._aside(lambda: self._loaded(present, path, relocalise))
             self._take(loaded)
+            self._newest = path
             response.success, response.message = True, f"loaded {loaded[0].core.newest().frames} poses from {path}"
         except ValueError as error:
             response.message = str(error)

@@ -112,7 +112,7 @@ class NgoNode(ManagedNode):
         self._begin_anew()
         self._configured = True
         built.callback(setattr, self, "_configured", False)
-        files = FileServices(
+        self._files = files = FileServices(
             self,
             settings,
             self._trajectory,
@@ -227,10 +227,25 @@ class NgoNode(ManagedNode):
             self._correct()
 
     def _on_internal_error(self) -> None:
-        """Begin anew: a fault of ours, and a robot is better off with a new map than without the node."""
-        forgotten = "the map starts anew" if self._search is None else "the pose is looked for anew"
-        self.get_logger().error(f"internal error, {forgotten}:\n{traceback.format_exc()}")
-        self._forget()
+        """Begin anew: a fault of ours, and a robot is better off with a new map than without the node.
+
+        A saved map that is to grow is loaded again: what failed may have spoilt the present one.
+        """
+        log, fault = self.get_logger().error, traceback.format_exc()
+        if self._settings.keeps_map:
+            log(f"internal error, the pose is looked for anew:\n{fault}")
+            self._forget()
+        elif self._search is None and self._settings.mode == "mapping":
+            log(f"internal error, the map starts anew:\n{fault}")
+            self._forget()
+        else:
+            log(f"internal error, the saved map is loaded again:\n{fault}")
+            try:
+                self._files.load_again()
+            except ValueError as error:
+                log(f"the map starts anew: {error}")
+                self._search = None
+                self._forget()
         self._status.dropped("relative pose", "internal error", warn=False)
 
     def _correct(self) -> None:
@@ -253,14 +268,16 @@ class NgoNode(ManagedNode):
         if not self._settings.looks_again or self._search is not None or not self._core.begins_anew(step):
             return
         with contextlib.suppress(ValueError):  # a map that shows no places yet
-            if not self._paused and (update := self._core.finish()) is not None:
-                self._latest = update
-                self._whole.changed(loops=True)
-            self._pending.cancel()
-            self._look_for_the_robot(self._session().joining())
+            self._look_for_the_robot()
             self.get_logger().info("the relative poses have a new origin: looks for the robot in the map, which stays")
 
-    def _look_for_the_robot(self, search: "MapLocalisation | Joining") -> None:
+    def _look_for_the_robot(self) -> None:
+        """Finish the map, and look for the robot in it; raises ``ValueError`` where it shows no places."""
+        if not self._paused and (update := self._core.finish()) is not None:
+            self._on_correction(update)
+        self._begin_search(self._session().joining())
+
+    def _begin_search(self, search: "MapLocalisation | Joining") -> None:
         self._search, self._covariance = PoseSearch(search), np.zeros((3, 3))
         self._out.smoothing.reset()
 
@@ -310,6 +327,8 @@ class NgoNode(ManagedNode):
     def _finish(self) -> None:
         """Optimise what waits for relative poses that do not come, and publish map -> odom as it is since the last."""
         self._pending.cancel()
+        if self._search is not None:  # it has the map as it is, and the pose is forgotten
+            return
         if not self._paused and (update := self._core.finish()) is not None:
             self._on_correction(update)
         if self._latest is not None:
@@ -352,13 +371,13 @@ class NgoNode(ManagedNode):
     def _on_initial_pose(self, message: PoseWithCovarianceStamped) -> None:
         try:
             given = messages.planar_estimate(message, self._settings.framed(self._settings.map_frame))
+            if self._search is None and self._settings.mode == "localization":
+                self._look_for_the_robot()
         except ValueError as error:
             self._status.dropped("initial pose", error)
             return
         x, y, yaw = given[0].tolist()
         there = f"the robot is at x {x:.3f} m, y {y:.3f} m, yaw {yaw:.3f} rad"
-        if self._search is None and self._settings.mode == "localization":
-            self._look_for_the_robot(self._session().joining())
         if self._search is not None:
             self._search.set_pose(*given)
             self._out.smoothing.reset()
@@ -383,7 +402,7 @@ class NgoNode(ManagedNode):
         self._report.begin_anew()
         self._search = None
         if search is not None:
-            self._look_for_the_robot(search)
+            self._begin_search(search)
         if self._inputs:
             self._pending.cancel()
         self._whole.changed(loops=True)
@@ -395,15 +414,20 @@ class NgoNode(ManagedNode):
         in_map = self._settings.mode == "localization"
         if not in_map:
             self._search = None
-        self._forget()
+        if in_map and self._search is None:
+            try:
+                self._look_for_the_robot()
+            except ValueError as error:
+                response.message = str(error)
+                return response
+        else:
+            self._forget()
         response.success, response.message = True, "forgot the pose in the map" if in_map else f"forgot {frames} poses"
         return response
 
     def _forget(self) -> None:
-        """Begin a new trajectory; in a saved map, which stays, look for the pose anew."""
-        if self._search is None and self._settings.mode == "localization":
-            self._look_for_the_robot(self._session().joining())
-        elif self._search is None:
+        """Begin a new trajectory; where the robot is looked for, forget its pose alone."""
+        if self._search is None:
             self._core.reset()
             self._begin_anew()
         else:
