@@ -36,6 +36,12 @@ _CONTRADICTS = 0.3
 _MUCH_RAD = 6.0
 """Wheels that correlate less at any offset, while both turned so much, tell nothing."""
 
+_SLIP_RPS = 0.15
+"""A wheel slips where the turn of the wheels is off from that of an IMU by more (rad/s)."""
+
+_LONGEST_FREEZE_NS = 2_000_000_000
+"""Wheels whose pose stays for so long froze, and catch up with what they missed; after longer they stood."""
+
 _SCALES = (0.7, 1.4)
 """Wheels within these are the front end's to judge."""
 
@@ -237,6 +243,8 @@ class CorrectedWheels:
         self._imu = imu
         self._raw: deque[tuple[int, Array]] = deque(maxlen=2000)
         self._poses: deque[tuple[int, Array]] = deque(maxlen=2000)
+        self._speed = np.zeros(2)  # while no wheel slipped
+        self._moved_ns = 0  # the stamp at which a pose was last another one
         self._changed = False  # whether poses are no longer as the wheels say
 
     def add(self, stamp_ns: int, pose: Array, truth: WheelTruth) -> tuple[int, Array]:
@@ -253,26 +261,32 @@ class CorrectedWheels:
             way, turn = math.hypot(step[0], step[1]), abs(step[2])
             if way > _FASTEST[0] * elapsed_s + _AT_ONCE[0] or turn > _FASTEST[1] * elapsed_s + _AT_ONCE[1]:
                 step, self._changed = np.zeros(3), True
-            elif self._imu.used:
+            elif self._imu.used and step.any():
                 offset_ns = round(truth.offset_s * 1e9)
-                step, self._changed = self._turned(step, self._raw[-1][0] - offset_ns, stamp_ns - offset_ns), True
+                from_ns = max(self._moved_ns, stamp_ns - _LONGEST_FREEZE_NS)
+                step, self._changed = self._turned(step, from_ns - offset_ns, stamp_ns - offset_ns), True
             self._changed |= (truth.turn_scale, truth.way_scale) != (1.0, 1.0)
             if self._changed:
                 scaled = compose(self._poses[-1][1], step)
         made = stamp_ns + round((truth.age_s - truth.offset_s) * 1e9), scaled
         if not self._raw or stamp_ns > self._raw[-1][0]:
+            if not self._raw or not np.array_equal(pose, self._raw[-1][1]):
+                self._moved_ns = stamp_ns
             self._raw.append((stamp_ns, pose))
             self._poses.append(made)
         return made
 
     def _turned(self, step: Array, from_ns: int, to_ns: int) -> Array:
         """A step of the wheels with the turn of the IMU, on the arc that belongs to it."""
-        turn = self._imu.turn(from_ns, to_ns)
+        turn, elapsed_s = self._imu.turn(from_ns, to_ns), max((to_ns - from_ns) * 1e-9, 1e-3)
         if turn is None:
             return step
-        half = 0.5 * (turn - float(step[2]))
-        cos, sin = math.cos(half), math.sin(half)
-        return np.array((cos * step[0] - sin * step[1], sin * step[0] + cos * step[1], turn))
+        chord = _rotated(step[:2], -0.5 * float(step[2]))  # from the middle of the arc
+        if abs(turn - float(step[2])) < _SLIP_RPS * elapsed_s:
+            self._speed = chord / elapsed_s
+        else:  # a wheel slips: its way is as wrong as its turn
+            chord = self._speed * elapsed_s
+        return np.array((*_rotated(chord, 0.5 * turn), turn))
 
     def again(self, truth: WheelTruth) -> list[tuple[int, Array]]:
         """The last poses with what is known by now."""
@@ -310,3 +324,8 @@ class CorrectedWheels:
         off[2] = wrap(off[2])
         pose: Array = before + (stamp_ns - before_ns) / (after_ns - before_ns) * off
         return pose
+
+
+def _rotated(vector: Array, angle: float) -> Array:
+    cos, sin = math.cos(angle), math.sin(angle)
+    return np.array((cos * vector[0] - sin * vector[1], sin * vector[0] + cos * vector[1]))
