@@ -57,7 +57,7 @@ class World:
         node = probe.node
         self._map = node.create_publisher(OccupancyGrid, "map", LATCHED)
         self._updates = node.create_publisher(OccupancyGridUpdate, "map_updates", 10)
-        self.scan_m: float | None = None
+        self.scan_m: float | None = 5.0
         """What a scan shows all around, where there is one."""
         self.scans = node.create_publisher(LaserScan, "scan", 1)
         self._tf = node.create_publisher(TFMessage, "/tf", 100)
@@ -201,9 +201,14 @@ def test_cancel_time_limit_boundary_pause_and_a_robot_that_is_lost(world: World)
         handle, moved_m, heard = start(world, client, Explore.Goal()), world.moved_m, world.heard
         world.until(lambda: world.heard > heard + 30, "some velocities")
         assert world.moved_m < moved_m + 0.05, "the map is free ahead, but the scan is not"
+        world.scan_m = 5.0
+        world.until(lambda: world.moved_m > moved_m + 0.1, "going on")
         world.scan_m = None
+        world.until(lambda: "there is no new scan on scan" in node.log, "doubt")
+        world.until(lambda: world.twist == (0.0, 0.0), "a robot that stands")
         world.until(handle.cancel_goal_async().done, "the cancel")
         finish(world, handle)
+        world.scan_m = 5.0
 
         handle = start(world, client, Explore.Goal())
         lost = DiagnosticStatus(level=DiagnosticStatus.WARN, name="/ngo_node", message="lost: the deviation is 9 m")

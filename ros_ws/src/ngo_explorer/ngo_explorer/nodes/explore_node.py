@@ -124,6 +124,7 @@ class ExploreNode(Node):
         self._ended: Future = Future()
         self._request = goal
         self._renew()
+        self._home: Floats | None = None
         self._active, self._paused = True, False
         self._begun_s, self._sure_s = self._now_s(), time.monotonic()
         self._last_xy: Floats | None = None
@@ -179,11 +180,13 @@ class ExploreNode(Node):
             self._input.give_map(exploration.known)
         except ValueError as error:
             self.get_logger().warning(f"the map begins anew: {error}", throttle_duration_sec=5.0)
+            self._halt()
             self._renew()
             return
+        if self._request.return_to_start and self._home is None:
+            self._home = pose
         if self._pilot is None:
-            home = pose if self._request.return_to_start else None
-            self._pilot = Pilot(exploration, self._driver, self._settings.settle_s, home)
+            self._pilot = Pilot(exploration, self._driver, self._settings.settle_s, self._home)
         limit_s = self._request.time_limit.sec + 1e-9 * self._request.time_limit.nanosec
         if 0.0 < limit_s <= now_s - self._begun_s:
             self._end(Explore.Result.TIME_LIMIT)
@@ -205,19 +208,19 @@ class ExploreNode(Node):
             self._send_velocity(speed, turn_rate)
 
     def _doubtful(self, doubt: str, pose: Floats | None) -> None:
-        """A robot that does not know where it is goes nowhere: it turns once, to find what it knows, and waits."""
+        """A robot in doubt goes nowhere: where it sees, it turns once, to find what it knows, and waits."""
         self.get_logger().warning(f"the robot waits: {doubt}", throttle_duration_sec=5.0)
         self._halt()
         if time.monotonic() - self._sure_s > self._settings.lost_timeout_s:
             self._end(Explore.Result.LOST)
-        elif pose is not None and self._input.has_map and self._turned_rad < _SEARCH_RAD:
+        elif pose is not None and self._input.has_map and self._input.sees and self._turned_rad < _SEARCH_RAD:
             self._turned_rad += _SEARCH_RPS / self._settings.control_rate
             self._send_velocity(0.0, _SEARCH_RPS)
 
     def _halt(self) -> None:
         """Stop the robot; what it does afterwards is decided anew."""
+        self._driver.stop()
         if self._pilot is not None:
-            self._driver.stop()
             self._exploration.goal = None
         self._send_velocity(0.0, 0.0)
 

@@ -34,7 +34,10 @@ class ExploreNodeSettings(FramedSettings):
         2.5, "Longest time until the map holds what the robot sees, s.", minimum=0.1, maximum=60.0
     )
     pose_timeout_s: float = setting(
-        1.0, "Age of the pose from which on the robot waits, s.", minimum=0.05, maximum=60.0
+        1.0,
+        "Age of the pose, and of the scan with drive own, from which on the robot waits, s.",
+        minimum=0.05,
+        maximum=60.0,
     )
     lost_timeout_s: float = setting(
         60.0, "Time without a pose, a map or certainty after which an exploration ends, s.", minimum=1.0, maximum=3600.0

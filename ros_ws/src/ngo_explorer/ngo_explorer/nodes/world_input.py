@@ -35,7 +35,7 @@ class WorldInput:
         self._tree = TransformTree()
         self._mountings = TransformBuffer()
         self._hits: tuple[Floats, float] | None = None
-        self._heard_s = -math.inf
+        self._heard_s = self._scan_s = -math.inf
         self._pose: Floats | None = None
         self._pose_s = 0.0  # by its stamp
         self.deviation_m = -1.0
@@ -82,14 +82,21 @@ class WorldInput:
         return age_s if 0.0 < age_s < self._settings.pose_timeout_s else 0.0
 
     @property
+    def sees(self) -> bool:
+        """Whether scans come, where this node drives by them."""
+        return self._settings.drive != "own" or time.monotonic() - self._scan_s <= self._settings.pose_timeout_s
+
+    @property
     def doubt(self) -> str:
-        """Why the robot does not know where it is; empty: it does."""
+        """Why the robot does not know where it is, or what is around it; empty: it does."""
         if self.pose_xyyaw is None:
             return "there is no new pose"
         if self._lost:
             return self._lost
         if self.deviation_m > self._settings.deviation_m:
             return f"the position has a deviation of {self.deviation_m:.2f} m"
+        if not self.sees:
+            return f"there is no new scan on {self._settings.scan_topic}"
         return ""
 
     def give_map(self, known: KnownMap) -> None:
@@ -138,14 +145,19 @@ class WorldInput:
             self._hits = scan.hits(), 1e-9 * scan.stamp_ns
         else:
             self._dropped("a scan", f"/tf_static does not say where {scan.frame_id} sits on {base}")
+            return
+        self._scan_s = time.monotonic()
 
     def _on_tf(self, message: TFMessage) -> None:
         self._tree.take(message)
         settings = self._settings
         found = self._tree.pose(settings.framed(settings.map_frame), settings.framed(settings.base_frame))
-        # The base's own branch tells that the robot is heard of: map -> odom may come seldom.
-        if found is not None:
-            (self._pose, self._pose_s), self._heard_s = found, time.monotonic()
+        if found is None:
+            return
+        # The base's own branch tells that the robot is heard of: map -> odom may come seldom. 0: it has no stamps.
+        if found[1] != self._pose_s or not found[1]:
+            self._heard_s = time.monotonic()
+        self._pose, self._pose_s = found
 
     def _on_pose(self, message: PoseWithCovarianceStamped) -> None:
         covariance = np.array(message.pose.covariance).reshape(6, 6)[:2, :2]

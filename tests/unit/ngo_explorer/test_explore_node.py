@@ -1,0 +1,88 @@
+"""What makes the node doubt, and what it does where the map begins anew; no process, and a clock of the test's."""
+
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+from ngo_msgs.action import Explore
+from sensor_msgs.msg import LaserScan
+
+from ngo_explorer.nodes import world_input
+from ngo_explorer.nodes.drivers import PublishedGoals
+from ngo_explorer.nodes.explore_node import ExploreNode
+from ngo_explorer.nodes.settings import ExploreNodeSettings
+from ngo_explorer.settings import ExplorerConfig
+
+from .test_transforms import placed
+
+
+class Clocked:
+    """A node's input, and a clock that stands."""
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch, **settings: Any) -> None:
+        self.now_s = 0.0
+        monkeypatch.setattr(world_input, "time", SimpleNamespace(monotonic=lambda: self.now_s))
+        node: Any = SimpleNamespace(create_subscription=lambda *_: None)
+        self.input = world_input.WorldInput(node, ExploreNodeSettings(**settings))
+
+    def hear(self, child: str, stamp_s: int) -> str:
+        self.input._on_tf(placed("map", child, 1.0, stamp_s))
+        return self.input.doubt
+
+
+def test_only_its_own_new_transforms_tell_where_the_robot_is(monkeypatch: pytest.MonkeyPatch) -> None:
+    world = Clocked(monkeypatch)
+    assert world.hear("base_link", 7) == ""
+    world.now_s = 5.0
+    assert world.hear("wheel", 12) == world.hear("base_link", 7) == "there is no new pose"
+    assert world.hear("base_link", 12) == ""
+
+
+def test_it_does_not_drive_where_no_scan_comes(monkeypatch: pytest.MonkeyPatch) -> None:
+    assert Clocked(monkeypatch).hear("base_link", 1) == "", "drive nav2 needs no scan of ours"
+    world = Clocked(monkeypatch, drive="own", scan_topic="front")
+    assert world.hear("base_link", 1) == "there is no new scan on front" and not world.input.sees
+    scan = LaserScan(ranges=[1.0] * 9, angle_increment=0.1, range_max=9.0)
+    scan.header.frame_id = "base_link"
+    world.input._on_scan(scan)
+    assert world.input.doubt == "" and world.input.sees
+    world.now_s = 1.1
+    assert world.hear("base_link", 2) == "there is no new scan on front"
+
+
+class Bare(ExploreNode):
+    """The node without its communication."""
+
+    def __init__(self, maps: list[float]) -> None:
+        self._driver, self._settings, self._config = PublishedGoals(), ExploreNodeSettings(), ExplorerConfig()
+        self._velocities = None
+        self._input = SimpleNamespace(deviation_m=-1.0, give_map=lambda known: known.update(*self._map(maps.pop(0))))
+        self._request, self._home, self._begun_s = Explore.Goal(return_to_start=True), None, 0.0
+        self._renew()
+
+    def _map(self, resolution_m: float) -> tuple[np.ndarray, float, np.ndarray]:
+        return np.zeros((60, 60), np.int8), resolution_m, np.zeros(2)
+
+    def get_logger(self) -> Any:
+        return SimpleNamespace(warning=lambda *_, **__: None)
+
+    def _now_s(self) -> float:
+        return 0.0
+
+    def _tell(self) -> None:
+        pass
+
+
+def test_a_map_that_begins_anew_stops_who_drives_and_keeps_the_start() -> None:
+    node = Bare([0.1, 0.05, 0.05])
+    node._explore(np.array((2.0, 2.0, 0.0)))
+    assert node._driver.state == "driving"
+    node._explore(np.array((1.0, 1.0, 0.0)))
+    assert node._pilot is None and node._driver.state == "arrived"
+    node._driver.state = "driving"
+    node._halt()
+    assert node._driver.state == "arrived"
+    node._explore(np.array((1.0, 1.0, 0.0)))
+    assert node._pilot is not None
+    np.testing.assert_array_equal(node._pilot._home, (2.0, 2.0, 0.0))
