@@ -169,6 +169,8 @@ def geometry(low: float, high: float, increment: float, rays: int) -> Any:
         (-180, 180, 0.25, 1441, 0.25, None, None),
         (-90, math.nan, 1.0, 181, 1.0, None, "angle_max"),
         (-180, -181, 1.0, 360, 1.0, None, "angle_max"),
+        (150, -150, 1.0, 61, 1.0, None, "angle_max"),
+        (80, -80, 1.0, 201, 1.0, None, "angle_max"),
     ],
 )
 def test_angles_follow_the_rule(

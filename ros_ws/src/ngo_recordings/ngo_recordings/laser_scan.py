@@ -117,7 +117,9 @@ def scan_angles(message: Any, topic: str = "the scan") -> ScanAngles:
         return ScanAngles(low, implied, note)
     apart = abs(low + (count - 1) * increment - high)
     given_deg, implied_deg = math.degrees(increment), math.degrees(implied)
-    wraps = abs(apart - _FULL_TURN) <= _SLACK_RAYS * abs(increment) and abs(implied) < 0.5 * abs(increment)
+    turned = abs(implied + increment) <= _SLACK_RAYS * abs(increment) / count  # half a turn, told the other way round
+    wraps = abs(apart - _FULL_TURN) <= _SLACK_RAYS * abs(increment) and not turned
+    wraps &= abs(increment) * (count - 1) <= _FULL_TURN + _SLACK_RAYS * abs(increment)
     if count > 1 and apart > _SLACK_RAYS * abs(increment) and is_increment(implied, count) and not wraps:
         note = f"the increment of {topic} is {given_deg:.4f} deg and contradicts its ends: {implied_deg:.4f} deg counts"
         return ScanAngles(low, implied, note)
