@@ -34,6 +34,9 @@ _LEARNED_M, _LEARNED_RAD = 6.0, 6.0
 _LOST_SHARE = 0.01
 """Of the first scans: with so many that do not say where they were taken, wheels are doubted."""
 
+_TO_BLAME = 0.5
+"""Without wheels that are to blame, fewer scans than this share of those get lost."""
+
 
 class LidarRun:
     """Feeds scans and wheel poses through both estimators as the nodes do with messages.
@@ -100,21 +103,25 @@ class LidarRun:
     def learn(self, records: Iterable[LidarRecord]) -> WheelTruth:
         """Look at the beginning of a recording for what is to be known of scanners and wheels, before a run.
 
-        Where scans get lost by the wheels, scans alone are asked. Returns what is wrong with the wheels. Live, it is
-        learned on the way.
+        Where scans get lost by the wheels, scans alone are asked: where these get lost as well, it was not for the
+        wheels. Returns what is wrong with the wheels. Live, it is learned on the way.
         """
         read: list[LidarRecord] = []
         lost = self._look_at(records, read)
-        if lost and self._odometry.has_wheels:
-            self._odometry.reset()
-            self._odometry.doubt_wheels()
-            self._look_at(read, [])
         known = self._odometry.keep_lag()
+        if lost > _LOST_SHARE and self._odometry.has_wheels:
+            self._odometry.reset()
+            self._odometry.judge_wheels(WheelTruth(useless=True))
+            alone = self._look_at(read, [])
+            doubted = self._odometry.keep_lag()
+            if not doubted.useless or alone < _TO_BLAME * lost:
+                known = doubted
+            self._odometry.judge_wheels(known)
         self._odometry.reset()
         return known
 
-    def _look_at(self, records: Iterable[LidarRecord], read: list[LidarRecord]) -> bool:
-        """Go over records until enough is known, and keep what was read; returns whether scans got lost."""
+    def _look_at(self, records: Iterable[LidarRecord], read: list[LidarRecord]) -> float:
+        """Go over records until enough is known, and keep what was read; returns the share of scans that got lost."""
         scans, unsure, way_m, turn_rad = 0, 0, 0.0, 0.0
         for record in records:
             read.append(record)
@@ -132,7 +139,7 @@ class LidarRun:
                     turn_rad += abs(float(step.relative_xyyaw[2]))
             if scans > _LEARNED_SCANS or (way_m > _LEARNED_M and turn_rad > _LEARNED_RAD):
                 break
-        return unsure > _LOST_SHARE * scans
+        return unsure / max(scans, 1)
 
     def run(self, records: Iterable[LidarRecord], truth: Truth | None = None) -> Iterator[RecordedStep | RecordedRun]:
         """Every step, and after the last one of a trajectory the whole of it.

@@ -208,9 +208,9 @@ class LidarIntake:
                 if not self._clock.truth.useless:
                     self.front_end.add_wheels(stamp_ns, pose)
 
-    def doubt_wheels(self) -> None:
-        """Use no wheels until the scans say the same as they do."""
-        self._clock.truth = WheelTruth(useless=True)
+    def judge_wheels(self, truth: WheelTruth) -> None:
+        """Take this of the wheels until the scans say more; useless ones until the scans say the same as they do."""
+        self._clock.truth = truth
 
     def keep_lag(self) -> WheelTruth:
         """Take the age of scans that is known by now for what comes after a reset; returns all of the wheels."""
