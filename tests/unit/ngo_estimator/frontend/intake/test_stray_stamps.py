@@ -25,6 +25,8 @@ def run_of(begin_ns: int) -> list[int]:
         (run_of(BEGIN), run_of(BEGIN)),
         ([0, *run_of(BEGIN)], run_of(BEGIN)),
         ([BEGIN * 2, *run_of(BEGIN)], run_of(BEGIN)),
+        ([BEGIN], [BEGIN]),
+        ([*run_of(BEGIN), 0], run_of(BEGIN)),
         ([*run_of(BEGIN), 0, *run_of(BEGIN + S)], [*run_of(BEGIN), *run_of(BEGIN + S)]),
         ([*run_of(BEGIN), 0, BEGIN * 3, *run_of(BEGIN + S)], [*run_of(BEGIN), *run_of(BEGIN + S)]),
         ([*run_of(BEGIN), 0, *run_of(BEGIN + 900 * S)], [*run_of(BEGIN), *run_of(BEGIN + 900 * S)]),

@@ -45,8 +45,11 @@ class StrayStamps(Generic[Record]):
         return found
 
     def flush(self) -> list[Record]:
-        """The record that waits, if there is one: nothing more comes."""
+        """The record that waits, if it is the only one: nothing more comes, and one that jumps begins nothing."""
         held, self._held = self._held, None
+        if held is not None and self._last_ns is not None:
+            self.left_out += 1
+            return []
         return [] if held is None else [held]
 
 
