@@ -166,7 +166,10 @@ def _command(arguments: Arguments) -> str:
     rows = "" if arguments.rows == ROWS else f" --rows {' '.join(arguments.rows)}"
     scale = "" if arguments.scale == Arguments.scale else f" --scale {arguments.scale:g}"
     own = "" if arguments.own_rows == Arguments.own_rows else f" --own-rows {' '.join(arguments.own_rows)}"
-    return f'make results WORLD=explore ARGS="{chosen}{rows}{own}{scale}"'
+    plans = "" if arguments.plans is None else " --plans FOLDER"
+    most = "" if arguments.most_s == Arguments.most_s else f" --most-s {arguments.most_s:g}"
+    split = "" if arguments.split == Arguments.split else f" --split {arguments.split}"
+    return f'make results WORLD=explore ARGS="{chosen}{rows}{own}{scale}{plans}{most}{split}"'
 
 
 def _table(kind: Kind, names: Sequence[str], arguments: Arguments) -> Table:

@@ -5,12 +5,15 @@ from typing import Any
 
 import numpy as np
 import pytest
+from builtin_interfaces.msg import Time
 from ngo_msgs.action import Explore
 from sensor_msgs.msg import LaserScan
 
+from ngo_explorer.exploration import Exploration
 from ngo_explorer.nodes import world_input
 from ngo_explorer.nodes.drivers import PublishedGoals
 from ngo_explorer.nodes.explore_node import ExploreNode
+from ngo_explorer.nodes.markers import frontier_markers
 from ngo_explorer.nodes.settings import ExploreNodeSettings
 from ngo_explorer.settings import ExplorerConfig
 
@@ -49,6 +52,19 @@ def test_it_does_not_drive_where_no_scan_comes(monkeypatch: pytest.MonkeyPatch) 
     assert world.input.doubt == "" and world.input.sees
     world.now_s = 1.1
     assert world.hear("base_link", 2) == "there is no new scan on front"
+
+
+def test_frontiers_are_shown_where_they_were_seen_though_the_map_has_grown() -> None:
+    exploration, shown = Exploration(ExplorerConfig(radius_m=0.2)), []
+    for corner in (0.0, -20.0):
+        values = np.full((60, 60 - 10 * int(corner)), -1, np.int8)
+        values[10:50, 10 - 10 * int(corner) : 50 - 10 * int(corner)] = 0
+        exploration.known.update(values, 0.1, np.array((corner, 0.0)))
+        if not shown:
+            exploration.decide(np.array((3.0, 3.0, 0.0)), 0.0)
+        points = frontier_markers(exploration, "map", Time()).markers[1].points
+        shown.append([(point.x, point.y) for point in points])
+    assert shown[0] == shown[1] and np.ptp(shown[0], axis=0).max() <= 4.0
 
 
 class Bare(ExploreNode):

@@ -82,8 +82,9 @@ def test_another_resolution_is_refused() -> None:
         found.update(np.zeros((9, 9), np.int8), 0.05, np.zeros(2))
 
 
-def test_a_mark_stays_through_updates_until_it_is_forgotten() -> None:
-    known, values = KnownMap(0.2, 0.6), np.zeros((40, 40), np.int8)
+@pytest.mark.parametrize("comfort_m", [0.6, 0.3])
+def test_a_mark_stays_through_updates_until_it_is_forgotten(comfort_m: float) -> None:
+    known, values = KnownMap(0.2, comfort_m), np.zeros((40, 40), np.int8)
     values[0] = 100
     known.update(values, 0.1, np.zeros(2))
     known.mark(np.array(((2.05, 2.05), (2.05, 0.25), (9.0, 9.0))))

@@ -23,9 +23,9 @@ Ints = NDArray[np.int64]
 
 @dataclass(frozen=True, eq=False)
 class Frontier:
-    """An edge of the unknown. ``cells`` ``(n,)`` are flat indices, ``point_xy`` ``(2,)`` is its middle cell (m)."""
+    """An edge of the unknown. ``points_xy`` ``(n, 2)`` are the middles of its cells, ``point_xy`` ``(2,)`` one (m)."""
 
-    cells: Ints
+    points_xy: Floats
     point_xy: Floats
     size_m: float
 
@@ -78,11 +78,11 @@ class FrontierFinder:
             across = 0.0 if self._by_cells else math.hypot(*np.ptp(at, axis=0).tolist()) + 1.0
             size_m = max(len(own), across) * known.resolution_m
             if size_m < self._least_m:
-                short.append(own[0])
+                short.append(at[0])
                 continue
-            middle = at[np.argmin(np.sum((at - at.mean(axis=0)) ** 2, axis=1))]
-            found.append(Frontier(own, known.points(middle[None])[0], size_m))
-        self.short_xy = known.points_of(np.array(short, np.int64))
+            points, middle = known.points(at), np.argmin(np.sum((at - at.mean(axis=0)) ** 2, axis=1))
+            found.append(Frontier(points, points[middle], size_m))
+        self.short_xy = known.points(np.array(short, np.int64).reshape(-1, 2))
         return found
 
 
@@ -100,14 +100,15 @@ def viewpoint(
     Of places that show at least half of the largest gain it is the one with the shortest way. None where no place is.
     field: costs of the blocks from `planner.cost_field`. barred: ``(n, 2)`` points that are no viewpoints any more.
     """
-    picks = np.linspace(0, len(frontier.cells) - 1, min(_SAMPLES, len(frontier.cells))).astype(np.int64)
+    count = len(frontier.points_xy)
+    picks = frontier.points_xy[np.linspace(0, count - 1, min(_SAMPLES, count)).astype(np.int64)]
     cells = np.array([known.cell(point) for point in barred], np.int64).reshape(-1, 2)
     found, costs = _viewpoints(
         known.state,
         known.clearance_m,
         field,
         known.block,
-        frontier.cells[picks],
+        np.array([known.cell(point) for point in picks], np.int64) @ (known.state.shape[1], 1),
         need_m,
         known.resolution_m,
         reach_m,

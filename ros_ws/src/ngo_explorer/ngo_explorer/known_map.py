@@ -17,7 +17,7 @@ UNKNOWN, FREE, OCCUPIED = -1, 0, 1
 Floats = NDArray[np.float64]
 Cells = NDArray[np.int8]
 
-_NEAR_CELLS = 3.0  # an obstacle that is this near in the map is the same
+_NEAR_CELLS = 3.0  # an obstacle that is nearer than this in the map is the same
 _TILE = 64  # cells along the side of a tile, at least
 
 
@@ -68,7 +68,8 @@ class KnownMap:
         rows, columns = self._cells(points_xy).T
         inside = (rows >= 0) & (rows < self.state.shape[0]) & (columns >= 0) & (columns < self.state.shape[1])
         points_xy, rows, columns = points_xy[inside], rows[inside], columns[inside]
-        new = points_xy[self.clearance_m[rows, columns] > _NEAR_CELLS * self.resolution_m]
+        # Clearance is known up to comfort_m only.
+        new = points_xy[self.clearance_m[rows, columns] >= min(_NEAR_CELLS * self.resolution_m, self.comfort_m)]
         if len(new):
             self._marked = np.vstack((self._marked, new))
             self._take(self._values())
@@ -89,10 +90,6 @@ class KnownMap:
     def points(self, cells: NDArray[np.int64]) -> Floats:
         """``(n, 2)`` the middles x, y of cells ``(n, 2)`` row, column."""
         return self._corner + (cells[:, ::-1] + 0.5) * self.resolution_m
-
-    def points_of(self, indices: NDArray[np.int64]) -> Floats:
-        """``(n, 2)`` the middles x, y of cells by their flat indices ``(n,)``."""
-        return self.points(np.stack(np.divmod(indices, max(1, self.state.shape[1])), axis=1))
 
     def cell(self, point_xy: Floats) -> tuple[int, int]:
         """Row and column of the cell that holds a point; it may be outside of the map."""

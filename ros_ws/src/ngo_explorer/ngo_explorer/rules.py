@@ -63,7 +63,7 @@ def _explore_lite(seen: Situation) -> Floats:
     """m-explore-ros2's cost with its defaults; its distance is a straight line to the nearest cell of the frontier."""
     costs = []
     for candidate in seen.candidates:
-        at = seen.known.points_of(candidate.frontier.cells)
+        at = candidate.frontier.points_xy
         costs.append(3.0 * np.hypot(*(at - seen.robot_xy).T).min() - 1.0 * candidate.frontier.size_m)
     return -np.array(costs)
 

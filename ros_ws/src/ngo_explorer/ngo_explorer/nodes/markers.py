@@ -43,7 +43,7 @@ def frontier_markers(exploration: Exploration, frame: str, stamp: Time) -> Marke
     chosen = exploration.goal.candidate if exploration.goal is not None else None
     for number, candidate in enumerate(exploration.candidates):
         color = _GREEN if candidate is chosen else _BLUE
-        markers.append(_cells(header, number, exploration.known.points_of(candidate.frontier.cells), size, color))
+        markers.append(_cells(header, number, candidate.frontier.points_xy, size, color))
     if exploration.unreachable:
         points = np.array([left.point_xy for left in exploration.unreachable])
         markers.append(_cells(header, len(markers), points, 3.0 * size, _RED))
