@@ -26,7 +26,12 @@ class Clocked:
     def __init__(self, monkeypatch: pytest.MonkeyPatch, **settings: Any) -> None:
         self.now_s = 0.0
         monkeypatch.setattr(world_input, "time", SimpleNamespace(monotonic=lambda: self.now_s))
-        node: Any = SimpleNamespace(create_subscription=lambda *_: None)
+        self.publishers, self.said = 1, []
+        node: Any = SimpleNamespace(
+            create_subscription=lambda *_: None,
+            count_publishers=lambda _: self.publishers,
+            get_logger=lambda: SimpleNamespace(warning=lambda said, once: self.said.append(said)),
+        )
         self.input = world_input.WorldInput(node, ExploreNodeSettings(**settings))
 
     def hear(self, child: str, stamp_s: int) -> str:
@@ -46,12 +51,14 @@ def test_it_does_not_drive_where_no_scan_comes(monkeypatch: pytest.MonkeyPatch) 
     assert Clocked(monkeypatch).hear("base_link", 1) == "", "drive nav2 needs no scan of ours"
     world = Clocked(monkeypatch, drive="own", scan_topic="front")
     assert world.hear("base_link", 1) == "there is no new scan on front" and not world.input.sees
+    world.publishers = 0
+    assert world.input.doubt == "" and "nobody publishes scans on front" in world.said[0], "it has no scanner"
     scan = LaserScan(ranges=[1.0] * 9, angle_increment=0.1, range_max=9.0)
     scan.header.frame_id = "base_link"
     world.input._on_scan(scan)
     assert world.input.doubt == "" and world.input.sees
     world.now_s = 1.1
-    assert world.hear("base_link", 2) == "there is no new scan on front"
+    assert world.hear("base_link", 2) == "there is no new scan on front", "though the publisher is gone"
 
 
 def test_frontiers_are_shown_where_they_were_seen_though_the_map_has_grown() -> None:

@@ -83,8 +83,15 @@ class WorldInput:
 
     @property
     def sees(self) -> bool:
-        """Whether scans come, where this node drives by them."""
-        return self._settings.drive != "own" or time.monotonic() - self._scan_s <= self._settings.pose_timeout_s
+        """Whether scans come, where this node drives by them. A robot without a scanner drives by its map alone."""
+        if self._settings.drive != "own" or time.monotonic() - self._scan_s <= self._settings.pose_timeout_s:
+            return True
+        topic = self._settings.scan_topic
+        has_scanner = self._scan_s > -math.inf or self._node.count_publishers(topic) > 0
+        if not has_scanner:
+            said = f"nobody publishes scans on {topic}: the robot stops before what is in its map alone"
+            self._node.get_logger().warning(said, once=True)
+        return not has_scanner
 
     @property
     def doubt(self) -> str:
