@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from ngo_estimator.frontend.intake import own_returns
 from ngo_estimator.frontend.lidar import motion_mixture, velocity_filter
 from ngo_estimator.geometry import branch_and_bound, mode_search, scan_matching, scan_points, scan_registration_kernels
 from ngo_estimator.graph import block_cholesky, loop_errors, normal_equations
@@ -56,7 +57,7 @@ WEIGHTS = Path(__file__).parents[4] / "ros_ws/src/ngo_estimator/weights"
 
 def test_registration_and_the_search_for_loops_are_compiled() -> None:
     warm_up_scans()
-    points, search = (scan_points._surfaces,), (mode_search._modes, branch_and_bound._best_first)
+    points, search = (scan_points._surfaces, own_returns._left_out), (mode_search._modes, branch_and_bound._best_first)
     without_wheels = velocity_filter._predicted, velocity_filter._corrected
     for function in (*points, scan_matching._icp, *search, motion_mixture._calibrated, *without_wheels):
         assert function.signatures, function

@@ -16,6 +16,7 @@ _RAYS = 180
 _HALF_M = np.array([6.0, 4.0])  # of the room
 _STEP_M = 0.35
 _STEPS = 60
+_OWN_RAYS, _OWN_M = 4, 0.15  # rays that see the robot itself, and how far away
 _SILENT = range(3, 13)
 """Steps without wheels: without them other things are run."""
 
@@ -31,6 +32,7 @@ def warm_up_odometry() -> list[LidarStep]:
         directions = np.stack((np.cos(angles + pose[2]), np.sin(angles + pose[2])), axis=1)
         with np.errstate(divide="ignore"):
             ranges = ((np.sign(directions) * _HALF_M - pose[:2]) / directions).min(axis=1)
+        ranges[:_OWN_RAYS] = _OWN_M
         if step not in _SILENT:
             odometry.add_wheels(step * _STEP_NS, between(first, pose))
         increment = 2.0 * math.pi / _RAYS
