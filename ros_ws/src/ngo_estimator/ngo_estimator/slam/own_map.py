@@ -145,7 +145,7 @@ class OwnMap:
     def _is_ambiguous(self, there: int, scans: Sequence[KeyScan], views: KeyScanViews, graph: PoseGraph) -> bool:
         """Whether places look alike on the robot's own way, or on that of a key scan where it would be found."""
         ends = np.append(graph.segments, len(graph))
-        for segment in (segment_of(graph.segments, np.array(there)), len(graph.segments) - 1):
+        for segment in {int(segment_of(graph.segments, np.array(there))), len(graph.segments) - 1}:
             way = np.arange(max(ends[segment], ends[segment + 1] - _WAY_KEYS), ends[segment + 1])
             if alike_share(way, scans, views, graph.poses, self._config.loops) > MOST_ALIKE:
                 return True
