@@ -16,24 +16,14 @@ import json
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
+from importlib import import_module
 from pathlib import Path
+from pkgutil import iter_modules
 from typing import Any, Literal
 
 import numpy as np
 
-from ngo_explorer import (
-    exploration,
-    frontiers,
-    known_map,
-    path_follower,
-    pilot,
-    planner,
-    put_aside,
-    revisits,
-    rules,
-    settings,
-    tours,
-)
+import ngo_explorer
 from ngo_explorer.settings import RULES, DriveConfig, ExplorerConfig
 from ngo_sim.floor_plans import FloorPlanConfig
 from ngo_sim.maze2d import Maze2DConfig
@@ -66,18 +56,8 @@ from training.scoring.table import (
 
 ROWS = (*(rule for rule in RULES if rule != "tour"), "known_tour", "ours", "ours_accurate")
 BASE = "explore_lite"
-_EXPLORER = (
-    exploration,
-    frontiers,
-    known_map,
-    path_follower,
-    pilot,
-    planner,
-    put_aside,
-    revisits,
-    rules,
-    settings,
-    tours,
+_EXPLORER = tuple(
+    import_module(f"ngo_explorer.{found.name}") for found in iter_modules(ngo_explorer.__path__) if not found.ispkg
 )
 _CODE = (*_EXPLORER, exploring, known_tour)
 _BUILDING_SEEDS = {"validation": range(12_000, 13_000), "test": BUILDING_TEST_SEEDS}
