@@ -50,8 +50,8 @@ and halls is moved within its room; doors move and people walk all the time. Eac
 another odometry: the state that was saved is loaded, the robot is looked for in it, and the map grows from there, as
 with `map_changes:=learn`. From {settings[most_scans]} key scans on, old ones leave the graph.
 
-- Error: root mean square distance of the drive's positions, from where the robot was found on, after the best rigid
-  motion. A drive in which the robot was never found has none.
+- Error: root mean square distance of the drive's positions, from where the robot was found on. The whole map is laid
+  on the truth by one rigid motion. A drive in which the robot was never found has none. Intervals are over drives.
 - IoU: of the cells of `/map` with those that exact rays from the true poses of its scans see in the building as it is
   at the end of the drive, with each door as it was at the scan. Cells have 5 cm: of the thin lines of occupied ones
   noise alone makes many differ. Where all scans count alike, older ones are not bounded.
