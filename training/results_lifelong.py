@@ -1,7 +1,7 @@
 """The tables of maps that last: several robots in one building, and one robot in a building that changes for a year.
 
     python -m training.results --world lifelong
-    python -m training.results --world lifelong --tables fleet --buildings 3 --aliased 3 --scans 1500
+    python -m training.results --world lifelong --tables fleet join --buildings 3 --aliased 3 --scans 1500
     python -m training.results --world lifelong --tables year --years 1 --drives 20 --year-scans 1000
 
 What is measured is kept in ``runs/``, of a year each drive, so that the command goes on after a stop. It writes
@@ -17,7 +17,7 @@ from typing import Any, Literal
 from ngo_estimator.frontend.lidar import mixture_lidar
 from ngo_estimator.loops.scan_settings import ScanGraphConfig
 from ngo_estimator.mapping import scan_map
-from ngo_estimator.slam import fleet, scan_trajectory, session
+from ngo_estimator.slam import fleet, scan_trajectory, session, session_union
 from training.common import records
 from training.common.command_line import check_at_least
 from training.common.source_code import code_digest
@@ -35,9 +35,10 @@ from training.scoring.year_rows import Year, patrol, year_numbers, year_ratios
 
 _YEAR_CODE = (session, scan_map, scan_trajectory, mixture_lidar, year_rows)
 _YEAR_FIRST = 200
-_CODE = (fleet, scan_trajectory, mixture_lidar, fleet_rows)
+_CODE = (fleet, session_union, scan_trajectory, mixture_lidar, fleet_rows)
 _SEEDS = {"validation": range(12_000, 13_000), "test": BUILDING_TEST_SEEDS[600:]}
-_ROWS = ("alone", "together")
+_ROWS = {"fleet": ("alone", "together"), "join": ("alone", "joined")}
+_PREFIX = {"buildings": "", "aliased": "aliased_"}
 _ALIASED_FIRST = 100  # of the seeds: aliased buildings are others
 
 
@@ -47,7 +48,7 @@ class Arguments(Folders):
 
     world: Literal["lifelong"] = "lifelong"
     """World to measure in."""
-    tables: tuple[Literal["fleet", "year"], ...] = ("fleet", "year")
+    tables: tuple[Literal["fleet", "join", "year"], ...] = ("fleet", "join", "year")
     """Tables to measure."""
     buildings: int = 5
     """Buildings that robots map together."""
@@ -80,13 +81,17 @@ def main(arguments: Arguments) -> dict[str, Any]:
     """Measure, write everything, and return the JSON's content."""
     record, path = records.record("results", arguments), arguments.out / "lifelong.json"
     result: dict[str, Any] = json.loads(path.read_text()) if path.exists() else {"tables": {}}
-    made: dict[str, dict[str, Table]] = {"fleet": {}, "year": {}}
+    made: dict[str, dict[str, Table]] = {"fleet": {}, "join": {}, "year": {}}
     for name in arguments.tables:
-        made[name] = {kind: _measured(kind, arguments) for kind in _KINDS[name]}
+        made[name] = {kind: _measured(name, kind, arguments) for kind in _KINDS[name]}
         how = {"command": _command(arguments, name), "revision": record["revision"]}
         settings = {setting: getattr(arguments, setting) for setting in ("split", *_SETTINGS[name])}
         if name == "fleet":
-            result |= {**how, "settings": settings, **_fleet(made[name], result["tables"])}
+            result |= {**how, "settings": settings, "paired": _paired(made[name], name)}
+            result["tables"][name] = _robots(made[name], name)
+        elif name == "join":
+            result |= {name: {**how, "settings": settings, "paired": _paired(made[name], name)}}
+            result["tables"][name] = _robots(made[name], name)
         else:
             result |= {
                 "year": {**how, "settings": settings, "ratios": year_ratios(column(made[name]["year"], "learn"))}
@@ -96,19 +101,29 @@ def main(arguments: Arguments) -> dict[str, Any]:
     return arguments.publish("lifelong", result, lifelong_page.page(result, arguments.images))
 
 
-_KINDS = {"fleet": ("buildings", "aliased"), "year": ("year",)}
+_KINDS = {"fleet": ("buildings", "aliased"), "join": ("buildings", "aliased"), "year": ("year",)}
 _SETTINGS = {
     "fleet": ("buildings", "aliased", "robots", "scans"),
+    "join": ("buildings", "aliased", "robots", "scans"),
     "year": ("years", "drives", "year_scans", "starts", "most_scans"),
 }
 
 
-def _fleet(found: dict[str, Table], tables: dict[str, Any]) -> dict[str, Any]:
-    names = {"buildings": "", "aliased": "aliased_"}
-    fleet = {f"{names[kind]}{row}": _numbers(table, row) for kind, table in found.items() for row in _ROWS}
+def _robots(found: dict[str, Table], name: str) -> dict[str, Numbers]:
     return {
-        "tables": {**tables, "fleet": fleet},
-        "paired": {f"{names[kind]}together": {"ate_ratio": _ratio(table)} for kind, table in found.items()},
+        f"{_PREFIX[kind]}{row}": intervals(samples(column(table, row)))
+        for kind, table in found.items()
+        for row in _ROWS[name]
+    }
+
+
+def _paired(found: dict[str, Table], name: str) -> dict[str, Any]:
+    """Error of the robots in one map, as a share of that of each alone, in the mean over buildings."""
+    alone, as_one = _ROWS[name]
+    both = {kind: pairs(table, as_one, alone, "ate_m") for kind, table in found.items()}
+    return {
+        f"{_PREFIX[kind]}{as_one}": {"ate_ratio": mean_interval(two[:, 0] / two[:, 1]).as_json()}
+        for kind, two in both.items()
     }
 
 
@@ -119,8 +134,8 @@ def _command(arguments: Arguments, table: str) -> str:
     return f'make results WORLD=lifelong ARGS="--tables {table} {chosen}"'
 
 
-def _measured(kind: str, arguments: Arguments) -> Table:
-    return _years(arguments) if kind == "year" else _fleets(kind, arguments)
+def _measured(name: str, kind: str, arguments: Arguments) -> Table:
+    return _years(arguments) if kind == "year" else _fleets(name, kind, arguments)
 
 
 def _years(arguments: Arguments) -> Table:
@@ -143,12 +158,12 @@ def _years(arguments: Arguments) -> Table:
     return measure(plan, folder, "year")
 
 
-def _fleets(kind: str, arguments: Arguments) -> Table:
+def _fleets(name: str, kind: str, arguments: Arguments) -> Table:
     aliased = kind == "aliased"
     seeds = _SEEDS[arguments.split]
     seeds = seeds[_ALIASED_FIRST:][: arguments.aliased] if aliased else seeds[: arguments.buildings]
     weights = arguments.weights / "scan"
-    rows = {row: Row(_MEASURES[row], folder_digest(weights), _CODE) for row in _ROWS}
+    rows = {row: Row(_MEASURES[row], folder_digest(weights), _CODE) for row in _ROWS[name]}
     drives = [
         Drive(
             f"{kind}_{seed}_{arguments.robots}",
@@ -165,14 +180,4 @@ def _runs(seed: int, aliased: bool, arguments: Arguments) -> FleetRuns:
     return FleetRuns(fleet_drives(seed, arguments.robots, arguments.scans, aliased), arguments.weights / "scan")
 
 
-_MEASURES = {"alone": FleetRuns.alone, "together": FleetRuns.together}
-
-
-def _numbers(table: Table, row: str) -> Numbers:
-    return intervals(samples(column(table, row)))
-
-
-def _ratio(table: Table) -> dict[str, Any]:
-    """Error of the robots together, as a share of that of each alone, in the mean over buildings."""
-    both = pairs(table, "together", "alone", "ate_m")
-    return mean_interval(both[:, 0] / both[:, 1]).as_json()
+_MEASURES = {"alone": FleetRuns.alone, "together": FleetRuns.together, "joined": FleetRuns.joined}

@@ -22,6 +22,11 @@ _COLUMNS = (
     Column("ms_a_step", "Computing time of a step, ms", number),
 )
 
+_JOIN_COLUMNS = (
+    *(column for column in _COLUMNS if column.key in ("ate_m", "joint_ate_m", "met", "false_meetings")),
+    Column("s_to_join", "Time to join, s", number),
+)
+
 _YEAR_COLUMNS = (
     Column("ate_m", "Error, m", number),
     Column("iou", "IoU of free cells", number),
@@ -80,6 +85,15 @@ ten a second. There are {settings[buildings]} buildings as drawn, and {settings[
 - Met in time: within 100 scans after two robots had 10 m of their way in common, a metre apart at most; scans from then
   on, where they met.
 - False meetings: buildings in which a robot ever was more than 2 m from where the common map had it."""
+
+_JOIN = """## Saved maps joined
+
+Made by `{command}`.
+
+{settings[robots]} robots drive as above, each maps alone, and `join_sessions` lays their saved states into one map
+afterwards (`joined`). There are {settings[buildings]} buildings as drawn, and {settings[aliased]} whose rooms look
+alike, of the {settings[split]} split. Met: the share of the other maps that were laid into the first one. False
+meetings: the map has a robot more than 2 m from where it was (root mean square)."""
 
 _RATIO = "Error together over error alone, in the mean over buildings: {together}, and {aliased} in aliased ones."
 
@@ -165,6 +179,11 @@ def page(result: dict[str, Any], images: Path) -> str:
         ratios = {name: interval(paired[f"{kind}together"]["ate_ratio"]) for name, kind in _RATIOS.items()}
         rows = {f"`{row}`": numbers for row, numbers in tables["fleet"].items()}
         parts += [_INTRODUCTION.format(**result), table(rows, _COLUMNS, "Row"), _RATIO.format(**ratios)]
+    if "join" in tables:
+        join = result["join"]
+        ratios = {name: interval(join["paired"][f"{kind}joined"]["ate_ratio"]) for name, kind in _RATIOS.items()}
+        rows = {f"`{row}`": numbers for row, numbers in tables["join"].items()}
+        parts += [_JOIN.format(**join), table(rows, _JOIN_COLUMNS, "Row"), _RATIO.format(**ratios)]
     if "year" in tables:
         year = result["year"]
         rows = {row.replace("_", " "): numbers for row, numbers in tables["year"].items()}

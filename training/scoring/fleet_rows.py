@@ -13,12 +13,14 @@ from scipy.spatial import KDTree
 
 from ngo_estimator.data.lidar_file import read_lidar_file
 from ngo_estimator.data.relative_step import RelativeStep
+from ngo_estimator.geometry import se2
 from ngo_estimator.loops.scan_settings import ScanGraphConfig
 from ngo_estimator.slam.fleet import Fleet
 from ngo_estimator.slam.scan_trajectory import ScanTrajectory
+from ngo_estimator.slam.session_union import united
 from training.data.lidar_drives import LidarDrive, TruePoses
 from training.scoring.lidar_rows import DriveRuns, Pipeline
-from training.scoring.metrics import absolute_error_m
+from training.scoring.metrics import absolute_error_m, position_rmse_m, rigid_motion
 from training.scoring.table import Measured
 
 SHARED_M = 10.0
@@ -119,6 +121,42 @@ class FleetRuns:
         found["ms_a_step"] = 1e3 * took_s / max(1, seen.steps)
         drawn["walls"] = fleet.walls(self.names[0], _MOST_WALL_POINTS)
         return Measured({**Measured.of(found).errors, **seen.delays()}, drawn)
+
+    def joined(self) -> Measured:
+        """Each robot maps alone and saves its state; then all are laid into the map of the first.
+
+        ``ate_m``, ``joint_ate_m`` and ``met`` are as of ``together``. ``false_meetings``: whether the map has a robot
+        elsewhere than it was. ``s_to_join``: computing time of the union.
+        """
+        cores = [self._mapped(robot) for robot in range(len(self._runs))]
+        began = time.process_time()
+        union = united(cores)
+        found = {"s_to_join": time.process_time() - began}
+        placed, errors, seen = union.trajectory.trajectory(), [], []
+        assert placed is not None
+        for robot, (core, later_ns) in enumerate(zip(cores, union.later_ns, strict=True)):
+            own = core.trajectory()
+            assert own is not None
+            poses, truth = own.poses_xyyaw, self.truth(robot, own.stamps_ns)
+            if robot not in union.left_out:
+                poses = placed.poses_xyyaw[np.searchsorted(placed.stamps_ns, own.stamps_ns + later_ns)]
+                seen.append((poses, truth))
+            errors.append(absolute_error_m(poses, truth))
+        fits = rigid_motion(seen[0][1][:, :2], seen[0][0][:, :2])
+        off_m = [position_rmse_m(poses, se2.compose(fits, truth)) for poses, truth in seen]
+        found |= {"ate_m": float(np.mean(errors)), "false_meetings": float(max(off_m) > _FALSE_M)}
+        found["met"] = (len(seen) - 1) / (len(cores) - 1)
+        found["joint_ate_m"] = absolute_error_m(*(np.concatenate(column) for column in zip(*seen, strict=True)))
+        return Measured.of(found)
+
+    def _mapped(self, robot: int) -> ScanTrajectory:
+        """The map of a robot alone."""
+        core = ScanTrajectory(self._graph)
+        for step in self._runs[robot].run(Pipeline()).front.steps:
+            core.update(step)
+            core.correct()
+        core.finish()
+        return core
 
 
 class _Seen:

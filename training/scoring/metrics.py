@@ -4,6 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from ngo_estimator.geometry import se2
 from training.data.batches import seen_from_first
 
 WITHIN_DEVIATIONS = 3.0
@@ -63,12 +64,16 @@ def within(poses: np.ndarray, covariances: np.ndarray, truth: np.ndarray) -> flo
 
 def absolute_error_m(estimate_xyyaw: np.ndarray, reference_xyyaw: np.ndarray) -> float:
     """Root mean square distance of positions, both ``(n, 3)``, after the planar rigid motion that makes it least."""
-    estimate, reference = (poses[:, :2] - poses[:, :2].mean(axis=0) for poses in (estimate_xyyaw, reference_xyyaw))
-    x, y = estimate.T
-    dot, cross = (estimate * reference).sum(), (x * reference[:, 1] - y * reference[:, 0]).sum()
-    cosine, sine = np.cos(np.arctan2(cross, dot)), np.sin(np.arctan2(cross, dot))
-    turned = np.stack((cosine * x - sine * y, sine * x + cosine * y), axis=-1)
-    return float(np.sqrt(((turned - reference) ** 2).sum(axis=1).mean()))
+    fits = rigid_motion(estimate_xyyaw[:, :2], reference_xyyaw[:, :2])
+    return position_rmse_m(se2.compose(fits, estimate_xyyaw), reference_xyyaw)
+
+
+def rigid_motion(points: np.ndarray, onto: np.ndarray) -> np.ndarray:
+    """The planar motion ``(3,)`` that carries points ``(n, 2)`` onto others with the least squares."""
+    middle, other = points.mean(axis=0), onto.mean(axis=0)
+    (x, y), (u, v) = (points - middle).T, (onto - other).T
+    yaw = float(np.arctan2((x * v - y * u).sum(), (x * u + y * v).sum()))
+    return np.array((*(other - se2.rotate(yaw, middle)), yaw))
 
 
 def position_rmse_m(poses: np.ndarray, truth: np.ndarray) -> float:

@@ -30,7 +30,7 @@ from training.data.lidar_drives import TruePoses
 from training.data.year_drives import YearDrive, year_drive
 from training.scoring.lidar_rows import DriveRuns, Pipeline
 from training.scoring.map_errors import intersections
-from training.scoring.metrics import position_rmse_m
+from training.scoring.metrics import position_rmse_m, rigid_motion
 from training.scoring.table import Measured, Numbers, intervals, read, write
 
 IN_TIME, MOST_SCANS = 50, 300
@@ -63,8 +63,9 @@ class Year:
 def patrol(year: Year, identity: str) -> Measured:
     """All numbers of each drive ``(drives,)``; NaN where a drive has none.
 
-    ``ate_m``: error of the drive's poses from where the robot was found on, in the map as a whole. ``iou``: of the map's free cells with those
-    of the building as it is now, and ``occupied_iou`` of the others; with ``_of_sums`` where all scans count alike.
+    ``ate_m``: error of the drive's poses from where the robot was found on, in the map as a whole.
+    ``iou``: of the map's free cells with those of the building as it is now, and ``occupied_iou`` of the others; with
+    ``_of_sums`` where all scans count alike.
     ``ms_a_scan``: computing time of odometry and correction, and ``map_ms_a_scan`` of the map. ``memory_mb``: size of
     all that a saved state holds. ``nodes``: of the graph. ``load_s``: time to load the state. Of the starts, the
     ``localised_share`` was found within 50 scans, the ``found_share`` within 300, in the mean after ``scans_to_claim``.
@@ -269,11 +270,3 @@ class _Drive:
         with written_whole(folder / "truth.npz") as file:
             np.savez(file, stamps_ns=self._known.stamps_ns, poses_xyyaw=self._known.poses_xyyaw)
         return 1e-6 * sum(array.nbytes for array in (*session.values(), *scans.values()))
-
-
-def rigid_motion(points: np.ndarray, onto: np.ndarray) -> np.ndarray:
-    """The planar motion ``(3,)`` that carries points ``(n, 2)`` onto others with the least squares."""
-    middle, other = points.mean(axis=0), onto.mean(axis=0)
-    (x, y), (u, v) = (points - middle).T, (onto - other).T
-    yaw = float(np.arctan2((x * v - y * u).sum(), (x * u + y * v).sum()))
-    return np.array((*(other - se2.rotate(yaw, middle)), yaw))

@@ -56,17 +56,20 @@ class Runs:
         )
 
 
-def test_the_table_has_a_row_for_each_way_and_kind(tmp_path: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize(("name", "row"), [("fleet", "together"), ("join", "joined")])
+def test_the_table_has_a_row_for_each_way_and_kind(
+    name: Any, row: str, tmp_path: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(results_lifelong, "_runs", lambda seed, aliased, arguments: Runs(0.1 + aliased))
     monkeypatch.setattr(
-        results_lifelong, "_MEASURES", {"alone": lambda runs: runs.alone(), "together": lambda runs: runs.together()}
+        results_lifelong, "_MEASURES", {"alone": lambda runs: runs.alone(), row: lambda runs: runs.together()}
     )
     folders = {name: tmp_path / name for name in ("out", "docs", "runs")}
-    chosen = results_lifelong.Arguments(split="validation", tables=("fleet",), buildings=2, aliased=2, **folders)
+    chosen = results_lifelong.Arguments(split="validation", tables=(name,), buildings=2, aliased=2, **folders)
     result = results_lifelong.main(chosen)
-    assert result["command"].endswith(' --split validation"')
-    fleet = result["tables"]["fleet"]
-    assert list(fleet) == ["alone", "together", "aliased_alone", "aliased_together"]
-    assert fleet["aliased_alone"]["ate_m"]["mean"] == pytest.approx(1.1)
-    assert result["paired"]["together"]["ate_ratio"]["mean"] == pytest.approx(0.5)
-    assert "| `together` | 0.0500 " in (tmp_path / "docs" / "results_lifelong.md").read_text()
+    how = result if name == "fleet" else result[name]
+    assert how["command"].endswith(' --split validation"')
+    assert list(result["tables"][name]) == ["alone", row, "aliased_alone", f"aliased_{row}"]
+    assert result["tables"][name]["aliased_alone"]["ate_m"]["mean"] == pytest.approx(1.1)
+    assert how["paired"][row]["ate_ratio"]["mean"] == pytest.approx(0.5)
+    assert f"| `{row}` | 0.0500 " in (tmp_path / "docs" / "results_lifelong.md").read_text()

@@ -11,8 +11,9 @@ from ngo_estimator.geometry import se2
 from training import results_lifelong
 from training.common.records import WEIGHTS
 from training.scoring import year_rows
+from training.scoring.metrics import rigid_motion
 from training.scoring.table import Measured
-from training.scoring.year_rows import Year, patrol, rigid_motion
+from training.scoring.year_rows import Year, patrol
 
 
 def test_the_motion_between_maps_is_found_again() -> None:
