@@ -9,10 +9,8 @@ import numpy as np
 from ngo_estimator.data.relative_step import LARGEST_ODOMETRY
 from ngo_estimator.frontend.intake.imu_turns import ImuTurns
 from ngo_estimator.frontend.intake.mounting_yaw import MountingYaw
-from ngo_estimator.frontend.intake.no_return import NoReturnValues
-from ngo_estimator.frontend.intake.own_returns import OwnReturns
+from ngo_estimator.frontend.intake.scanner import Scanner
 from ngo_estimator.frontend.intake.stray_stamps import StrayStamps
-from ngo_estimator.frontend.intake.sweep import MeasuredSweep
 from ngo_estimator.frontend.intake.turns import Part, Turns
 from ngo_estimator.frontend.intake.wheel_clock import CorrectedWheels, WheelClock, WheelTruth
 from ngo_estimator.frontend.lidar.lidar_step import LidarStep
@@ -42,9 +40,7 @@ class LidarIntake:
 
     def __init__(self, front_end: MixtureLidar, mounting_of: MountingOf, min_range_m: float = 0.0) -> None:
         self.front_end, self._mounting_of, self._min_range_m = front_end, mounting_of, min_range_m
-        self._no_return: dict[str, NoReturnValues] = {}
-        self._own: dict[str, OwnReturns] = {}
-        self._sweeps: dict[str, MeasuredSweep] = {}
+        self._scanners: dict[str, Scanner] = {}
         self._clock = WheelClock()
         self._imu = ImuTurns()
         self.reset()
@@ -56,8 +52,8 @@ class LidarIntake:
         self._stray_scans: StrayStamps[LidarScan] = StrayStamps()
         self._stray_wheels: StrayStamps[WheelPose] = StrayStamps()
         self._mountings: dict[str, Mounting | None] = {}
-        for sweep in self._sweeps.values():
-            sweep.interrupt()
+        for scanner in self._scanners.values():
+            scanner.sweep.interrupt()
         self._imu.interrupt()
         self._wheels = CorrectedWheels(self._imu)
         self._waiting_wheels: deque[WheelPose] = deque()
@@ -116,7 +112,7 @@ class LidarIntake:
                 return
             self._waiting_wheels.popleft()
             at_ns, pose = self._wheels.add(wheels.stamp_ns, wheels.pose_xyyaw, self._clock.truth)
-            if not self._clock.truth.useless:
+            if not (self._clock.truth.useless or self._wheels.frozen):
                 self.front_end.add_wheels(at_ns, pose)
 
     def add_scan(self, scan: LidarScan) -> None:
@@ -131,14 +127,9 @@ class LidarIntake:
         mounting = self._mountings[scanner]
         if mounting is None:
             return
-        if scan.range_min < self._min_range_m:
-            scan = replace(scan, range_min=self._min_range_m)
-        scan = self._no_return[scanner].clean(scan)
-        ranges = self._own[scanner].clean(scan)
-        if ranges is not scan.ranges:
-            scan = replace(scan, ranges=ranges)
-        scan = self._sweeps[scanner].correct(scan)
-        self._hand_on(self._turns.add(Part(scan, mounting, scanner)))
+        corrected = self._scanners[scanner].correct(scan, self._min_range_m)
+        if corrected is not None:
+            self._hand_on(self._turns.add(Part(corrected, mounting, scanner)))
 
     def remount(self) -> None:
         """Ask anew where all scanners sit."""
@@ -161,9 +152,7 @@ class LidarIntake:
             mounting = mounting or self.front_end.mounting
             self.front_end.mounting = mounting
         self._mountings[scanner] = mounting
-        self._no_return.setdefault(scanner, NoReturnValues())
-        self._own.setdefault(scanner, OwnReturns())
-        self._sweeps.setdefault(scanner, MeasuredSweep())
+        self._scanners.setdefault(scanner, Scanner())
 
     def ready(self, at_end: bool = False) -> Iterator[LidarStep]:
         """The steps to all scans whose wheels are known by now; ``at_end`` nothing more comes.
@@ -183,8 +172,10 @@ class LidarIntake:
             yield step if said is None else replace(step, robot_odom_xyyaw=said)
 
     def _observe(self, step: LidarStep) -> None:
-        for own in self._own.values():
-            own.moved(step.relative_xyyaw)
+        for scanner in self._scanners.values():
+            scanner.moved(step.relative_xyyaw)
+        if not step.unsure:
+            self._wheels.moved(step.relative_xyyaw)
         late_ns = round(self.front_end.lag_s * 1e9)
         motion = self._wheels.motion(step.from_stamp_ns - late_ns, step.stamp_ns - late_ns)
         elapsed_s = (step.stamp_ns - step.from_stamp_ns) * 1e-9
@@ -198,12 +189,12 @@ class LidarIntake:
             begin_ns, end_ns = step.from_stamp_ns - early_ns, step.stamp_ns - early_ns
             by_wheels = counted * self._clock.truth.turn_scale
             self._imu.observe(begin_ns, end_ns, float(step.relative_xyyaw[2]), by_wheels)
-        for scanner, sweep in self._sweeps.items():
-            if self._turns.alone and (mounting := self._mountings.get(scanner)) is not None:
-                sweep.observe(step.stamp_ns, step.relative_xyyaw, motion, elapsed_s, mounting)
+        for name, scanner in self._scanners.items():
+            if self._turns.alone and (mounting := self._mountings.get(name)) is not None:
+                scanner.sweep.observe(step.stamp_ns, step.relative_xyyaw, motion, elapsed_s, mounting)
         if not step.unsure and self._clock.add_step(step.from_stamp_ns, step.stamp_ns, step.relative_xyyaw):
-            for sweep in self._sweeps.values():
-                sweep.forget()
+            for scanner in self._scanners.values():
+                scanner.sweep.forget()
             for stamp_ns, pose in self._wheels.again(self._clock.truth):
                 if not self._clock.truth.useless:
                     self.front_end.add_wheels(stamp_ns, pose)
@@ -220,19 +211,13 @@ class LidarIntake:
     def remarks(self) -> list[str]:
         """What a person should know of the scans and wheels, a line each."""
         lines = self.problems()
-        for name, found in self._no_return.items():
-            if found.values:
-                values = ", ".join(f"{value:g}" for value in found.values)
-                lines.append(f"{name} says {values} m where nothing came back: taken so")
-        lines += [f"{name}: {line}" for name, sweep in self._sweeps.items() if (line := sweep.remark())]
+        lines += [line for name, scanner in self._scanners.items() for line in scanner.remarks(name)]
         lines += self._clock.truth.remarks()
+        lines += ["the wheels' pose stays while the robot drives: left out meanwhile"] if self._wheels.froze else []
         lines += [line] if (line := self._imu.remark()) else []
         for name, stray in (("scans", self._stray_scans), ("wheels", self._stray_wheels)):
             if stray.left_out:
                 lines.append(f"{stray.left_out} of the {name} are stamped far from those before and after: left out")
-        for name, own in self._own.items():
-            if own.rays:
-                lines.append(f"{own.rays} rays of {name} see the robot itself: left out")
         return lines
 
     def news(self) -> list[str]:

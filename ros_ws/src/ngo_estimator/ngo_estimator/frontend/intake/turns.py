@@ -117,7 +117,7 @@ class Turns:
 
 
 def together(parts: list[Part], first: Part) -> LidarScan:
-    """Several scans as one of the scanner ``first``, with the stamp of the latest.
+    """Several scans as one of the scanner ``first``, with the stamp at which the last of the scanners began.
 
     Where two see a direction, the nearer range counts.
     """
@@ -126,11 +126,13 @@ def together(parts: list[Part], first: Part) -> LidarScan:
     increment = min(abs(part.scan.angle_increment) for part in parts)
     count = min(math.ceil(math.tau / increment - 1e-6), _MOST_RAYS)
     increment = math.tau / count
-    stamp_ns = max(part.scan.stamp_ns for part in parts)
+    began_ns = {part.scanner: part.scan.stamp_ns for part in reversed(parts)}
+    stamp_ns = max(began_ns.values())
     ranges, offsets = np.full(count, np.nan), np.zeros(count)
     low = first.scan.angle_min
     for part in parts:
         angles, reach, late = _seen_from(part, first.mounting, stamp_ns)
+        late = late + _begin_s(part, parts)
         rays = np.rint((angles - low) / increment).astype(np.int64) % count
         known = np.isfinite(reach)
         free = rays[~known & np.isnan(ranges[rays])]
@@ -151,6 +153,16 @@ def together(parts: list[Part], first: Part) -> LidarScan:
         first.scan.frame_id,
         offsets if offsets.any() else None,
     )
+
+
+def _begin_s(part: Part, parts: list[Part]) -> float:
+    """When a part began after its stamp (s): sectors that carry one stamp were measured one after the other."""
+    scan = part.scan
+    first = next(other for other in parts if (other.scanner, other.scan.stamp_ns) == (part.scanner, scan.stamp_ns))
+    if first is part or scan.offsets_s is not None:
+        return 0.0
+    rays = (scan.angle_min - first.scan.angle_min) / scan.angle_increment
+    return scan.time_increment * (rays % (math.tau / abs(scan.angle_increment)))
 
 
 def _seen_from(part: Part, sensor: Mounting, stamp_ns: int) -> tuple[Array, Array, Array]:

@@ -40,7 +40,10 @@ _SLIP_RPS = 0.15
 """A wheel slips where the turn of the wheels is off from that of an IMU by more (rad/s)."""
 
 _LONGEST_FREEZE_NS = 2_000_000_000
-"""Wheels whose pose stays for so long froze, and catch up with what they missed; after longer they stood."""
+"""Wheels whose pose stays for so long froze, and catch up with what they missed; after longer they stood, unless the
+scans moved by more than this."""
+
+_FROZEN_M, _FROZEN_RAD = 0.3, 0.3
 
 _SCALES = (0.7, 1.4)
 """Wheels within these are the front end's to judge."""
@@ -245,6 +248,9 @@ class CorrectedWheels:
         self._poses: deque[tuple[int, Array]] = deque(maxlen=2000)
         self._speed = np.zeros(2)  # while no wheel slipped
         self._moved_ns = 0  # the stamp at which a pose was last another one
+        self._since = np.zeros(3)  # the motion by scans since then
+        self.froze = False
+        """Whether the pose ever stayed while the robot drove."""
         self._changed = False  # whether poses are no longer as the wheels say
 
     def add(self, stamp_ns: int, pose: Array, truth: WheelTruth) -> tuple[int, Array]:
@@ -271,7 +277,7 @@ class CorrectedWheels:
         made = stamp_ns + round((truth.age_s - truth.offset_s) * 1e9), scaled
         if not self._raw or stamp_ns > self._raw[-1][0]:
             if not self._raw or not np.array_equal(pose, self._raw[-1][1]):
-                self._moved_ns = stamp_ns
+                self._moved_ns, self._since = stamp_ns, np.zeros(3)
             self._raw.append((stamp_ns, pose))
             self._poses.append(made)
         return made
@@ -295,15 +301,27 @@ class CorrectedWheels:
         self._poses.clear()
         return [self.add(stamp_ns, pose, truth) for stamp_ns, pose in raw]
 
+    def moved(self, step: Array) -> None:
+        """Take the motion ``(3,)`` from scan to scan, by the scans."""
+        self._since = compose(self._since, step)
+        if self.frozen:
+            self.froze = self._changed = True
+
+    @property
+    def frozen(self) -> bool:
+        """Whether the pose stays while the robot drives: it tells nothing then."""
+        stayed = bool(self._raw) and self._raw[-1][0] - self._moved_ns > _LONGEST_FREEZE_NS
+        return stayed and (math.hypot(*self._since[:2]) > _FROZEN_M or abs(self._since[2]) > _FROZEN_RAD)
+
     def motion(self, from_ns: int, to_ns: int) -> Array | None:
         """The motion ``(3,)`` between two stamps; None where it is not known."""
         begin, end = self._at(self._poses, from_ns), self._at(self._poses, to_ns)
-        return None if begin is None or end is None else between(begin, end)
+        return None if self.frozen or begin is None or end is None else between(begin, end)
 
     def turn(self, from_ns: int, to_ns: int) -> float | None:
         """The turn between two stamps as the wheels say it (rad); None where it is not known."""
         begin, end = self._at(self._raw, from_ns), self._at(self._raw, to_ns)
-        return None if begin is None or end is None else wrap(float(end[2] - begin[2]))
+        return None if self.frozen or begin is None or end is None else wrap(float(end[2] - begin[2]))
 
     def said(self, stamp_ns: int) -> Array | None:
         """The pose ``(3,)`` as the wheels say it, at a stamp by the scans' clock; None where it is not known, or is

@@ -1,0 +1,156 @@
+"""What drivers of scanners and wheels say wrongly is noticed by itself, and sound ones are left as they are."""
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from ngo_estimator.frontend.intake.imu_turns import ImuTurns
+from ngo_estimator.frontend.intake.no_return import NoReturnValues
+from ngo_estimator.frontend.intake.scanner import Scanner
+from ngo_estimator.frontend.intake.turns import Part, together
+from ngo_estimator.frontend.intake.wheel_clock import CorrectedWheels, WheelTruth
+from ngo_estimator.geometry.planar_motion import Array, between, compose
+from ngo_estimator.geometry.scan_points import Mounting
+from ngo_recordings.scan_stream import LidarScan
+from tests.unit.ngo_estimator.ray_casting import ROOM, cast
+
+RAYS = 360
+STEP = np.array((0.1, 0.0, 0.03))
+NO_RETURN_M = 3.2
+
+
+def drive(count: int = 60, noise_m: float = 0.005) -> list[LidarScan]:
+    noise, pose, scans = np.random.default_rng(0), np.array((1.0, 1.0, 0.2)), []
+    angles = np.linspace(-math.pi, math.pi, RAYS, endpoint=False)
+    for k in range(count):
+        ranges = (cast(ROOM, pose, angles) + noise.normal(0.0, noise_m, RAYS)).astype(np.float32)
+        scans.append(LidarScan(k * 10**8, -math.pi, math.tau / RAYS, ranges, 0.05, 30.0, 0.1 / RAYS, "laser"))
+        pose = compose(pose, STEP)
+    return scans
+
+
+@pytest.mark.parametrize("jitter_m", [0.0, 0.004])
+@pytest.mark.parametrize("beyond", [False, True])
+def test_a_value_that_means_no_return_may_jitter(jitter_m: float, beyond: bool) -> None:
+    noise, found = np.random.default_rng(1), NoReturnValues()
+    for scan in drive():
+        far = scan.ranges > NO_RETURN_M
+        ranges = np.where(far, NO_RETURN_M + jitter_m * noise.standard_normal(RAYS), scan.ranges).astype(np.float32)
+        if beyond:  # a few walls there are seen
+            ranges[np.flatnonzero(far)[:2]] = 7.0
+        clean = found.clean(replace(scan, ranges=ranges))
+        found.moved(STEP)
+    assert found.values == pytest.approx([NO_RETURN_M], abs=1e-6)
+    usable = clean.ranges < clean.range_max  # not a number is not
+    assert far.sum() > 20 and (usable & far).sum() == 2 * beyond
+    assert (usable & (scan.ranges < NO_RETURN_M - 0.05)).sum() == (scan.ranges < NO_RETURN_M - 0.05).sum()
+
+
+def test_what_stands_in_the_room_is_no_value_of_no_return() -> None:
+    """Also where the robot turns beside it on the spot, and where it drives past."""
+    found, turning = NoReturnValues(), NoReturnValues()
+    for k, scan in enumerate(drive()):
+        ranges = scan.ranges.copy()
+        ranges[np.arange(20) + 5 * k] = 0.7 + 0.001 * np.arange(20)
+        turning.clean(replace(scan, ranges=ranges))
+        turning.moved(np.array((0.0, 0.0, 0.1)))
+        beside = math.hypot(0.7, 0.1 * (k - 30))
+        ranges[np.arange(20) + 5 * k] = beside + 0.001 * np.arange(20)
+        found.clean(replace(scan, ranges=ranges))
+        found.moved(STEP)
+    assert found.values == [] and turning.values == []
+
+
+@pytest.mark.parametrize(("limit_m", "unit"), [(30.0, 1.0), (30_000.0, 0.001), (0.0, 1.0)])
+def test_ranges_in_millimetres_are_told_and_scaled(limit_m: float, unit: float) -> None:
+    scanner = Scanner()
+    for scan in drive(10):
+        wrong = replace(scan, ranges=np.round(scan.ranges * 1000.0), range_max=limit_m, range_min=0.05 / unit)
+        found = scanner.correct(wrong, 0.0)
+    assert found is not None
+    np.testing.assert_allclose(found.ranges, scan.ranges, atol=0.001)
+    assert found.range_max == pytest.approx(limit_m * unit) and found.range_min == pytest.approx(0.05)
+    assert scanner.remarks("laser") == ["laser: its ranges are in millimetres: taken so"]
+
+
+def test_ranges_far_away_and_codes_for_no_return_are_metres() -> None:
+    scanner = Scanner()
+    for scan in drive(10):
+        code = np.full(RAYS, 65_535.0, np.float32)
+        code[::12] = scan.ranges[::12]
+        for ranges in (code, 30.0 * scan.ranges):
+            found = scanner.correct(replace(scan, ranges=ranges, range_max=0.0), 0.0)
+            assert found is not None and np.array_equal(found.ranges, ranges)
+    assert not any("millimetres" in line for line in scanner.remarks("laser"))
+
+
+@pytest.mark.parametrize("late_ns", [1_000_000, 50_000_000])
+def test_a_scan_that_is_published_again_is_left_out(late_ns: int) -> None:
+    scanner = Scanner()
+    scans = drive(20)
+    kept = [
+        found
+        for scan in scans
+        for again in (scan, replace(scan, stamp_ns=scan.stamp_ns + late_ns))
+        if (found := scanner.correct(again, 0.0)) is not None
+    ]
+    assert [scan.stamp_ns for scan in kept[-19:]] == [scan.stamp_ns for scan in scans[1:]]
+    assert "scans are the one before once more" in scanner.remarks("laser")[0]
+
+
+def test_a_simulated_robot_that_stands_sees_the_same_at_its_usual_pace() -> None:
+    scanner, scans = Scanner(), drive(10, noise_m=0.0)
+    standing = [replace(scans[-1], stamp_ns=scans[-1].stamp_ns + k * 10**8) for k in range(1, 20)]
+    assert all(scanner.correct(scan, 0.0) is not None for scan in [*scans, *standing])
+    assert scanner.remarks("laser") == []
+
+
+@pytest.mark.parametrize("direction", [1.0, -1.0])
+def test_sectors_that_carry_one_stamp_were_measured_one_after_the_other(direction: float) -> None:
+    (scan,) = drive(1)
+    scan = replace(scan, angle_min=-direction * math.pi, angle_increment=direction * scan.angle_increment)
+    mounting, third = Mounting(np.zeros(3)), RAYS // 3
+    sectors = [
+        replace(scan, angle_min=scan.angles[first], ranges=scan.ranges[first : first + third])
+        for first in range(0, RAYS, third)
+    ]
+    parts = [Part(sector, mounting, "laser") for sector in sectors]
+    whole = together(parts, parts[0])
+    if direction < 0.0:  # a turn counts its rays counter-clockwise
+        expected = np.roll(scan.ray_offsets_s[::-1], 1)
+    else:
+        expected = scan.ray_offsets_s
+    np.testing.assert_allclose(whole.ray_offsets_s, expected, atol=1e-9)
+
+
+def test_wheels_whose_pose_stays_while_the_robot_drives_tell_nothing() -> None:
+    wheels, pose = CorrectedWheels(ImuTurns()), np.zeros(3)
+
+    def second(at_s: int, step: Array) -> None:
+        nonlocal pose
+        pose = compose(pose, step)
+        wheels.add(at_s * 10**9, pose, WheelTruth())
+        wheels.moved(np.array((0.2, 0.0, 0.0)))
+
+    for k in range(3):
+        second(k, np.array((0.2, 0.0, 0.0)))
+    for k in range(3, 8):
+        second(k, np.zeros(3))
+    assert wheels.frozen and wheels.froze
+    assert wheels.motion(6 * 10**9, 7 * 10**9) is None and wheels.turn(6 * 10**9, 7 * 10**9) is None
+    said = wheels.said(7 * 10**9)
+    assert said is not None and np.array_equal(said, pose)
+    second(8, np.array((1.2, 0.0, 0.0)))  # they catch up
+    motion = wheels.motion(7 * 10**9, 8 * 10**9)
+    assert not wheels.frozen and motion is not None
+    np.testing.assert_allclose(motion, between(np.zeros(3), np.array((1.2, 0.0, 0.0))))
+
+
+def test_wheels_of_a_robot_that_stands_count() -> None:
+    wheels = CorrectedWheels(ImuTurns())
+    for k in range(60):
+        wheels.add(k * 10**9, np.zeros(3), WheelTruth())
+        wheels.moved(np.array((0.004 * (-1) ** k, 0.0, 0.0)))  # a match is never exact
+    assert not wheels.frozen and wheels.motion(10**9, 2 * 10**9) is not None
