@@ -17,7 +17,7 @@ from ngo_estimator.geometry.planar_motion import between
 from ngo_estimator.offline.lidar_run import LidarRecord, LidarRun
 from ngo_estimator.offline.recorded import RecordedRun, RecordedStep
 from ngo_estimator.slam.scan_trajectory import ScanTrajectory
-from ngo_recordings.scan_stream import LidarScan, YawRate
+from ngo_recordings.scan_stream import ImuReading, LidarScan
 from ngo_sim.building2d import Building2d, BuildingDrive
 from ngo_sim.floor_plans import FloorPlanConfig
 from training.data.building_drives import lidar_drive
@@ -90,7 +90,7 @@ def _order(record: LidarRecord) -> tuple[int, bool]:
     return record.stamp_ns, isinstance(record, LidarScan)
 
 
-def _imu(drive: BuildingDrive, variant: str) -> list[YawRate]:
+def _imu(drive: BuildingDrive, variant: str) -> list[ImuReading]:
     """Readings by the clock of the wheels."""
     noise = np.random.default_rng(7)
     times = np.arange(drive.stamps_s[0], drive.stamps_s[-1], 1.0 / _RATE_HZ)
@@ -99,7 +99,7 @@ def _imu(drive: BuildingDrive, variant: str) -> list[YawRate]:
     rates = rates * (variant != "noise alone") + _BIAS_RPS + noise.normal(0.0, _NOISE_RPS, len(times))
     late_s = (float(variant[:3]) if variant.endswith("late") else 0.0) - drive.wheels.lag_s
     stamps_ns = simulated_stamps_ns(times + late_s)
-    return [YawRate(stamp_ns, rate) for stamp_ns, rate in zip(stamps_ns.tolist(), rates.tolist(), strict=True)]
+    return [ImuReading(stamp_ns, rate) for stamp_ns, rate in zip(stamps_ns.tolist(), rates.tolist(), strict=True)]
 
 
 if __name__ == "__main__":

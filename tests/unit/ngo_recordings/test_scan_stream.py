@@ -16,7 +16,7 @@ from ngo_recordings.lidar_description import describe_lidar
 from ngo_recordings.mounting import find_mounting
 from ngo_recordings.odometry_poses import OdometryPoses
 from ngo_recordings.recording import open_recording
-from ngo_recordings.scan_stream import BAD_SCAN, BAD_WHEELS, WheelPose, YawRate, scan_stream
+from ngo_recordings.scan_stream import BAD_SCAN, BAD_WHEELS, ImuReading, WheelPose, scan_stream
 from ngo_recordings.topics import GroundTruth, RecordingTopics, TopicArguments, WheelSource, choose_topics
 
 from . import messages as m
@@ -319,21 +319,23 @@ def test_wheels_are_those_that_carry_the_scanner(tmp_path: Path, scans: str, whe
 
 
 @pytest.mark.parametrize(("roll", "rate"), [(0.0, 0.3), (math.pi, -0.3), (math.pi / 2, 0.1)])
-def test_the_yaw_rate_of_an_imu_is_about_the_robots_own_axis(tmp_path: Path, roll: float, rate: float) -> None:
+def test_an_imu_says_the_robots_own_yaw_rate_and_where_up_is(tmp_path: Path, roll: float, rate: float) -> None:
     entries = drive(5)
     entries.append(("/tf_static", 1, m.transforms(static("base_link", "gyro", 0.1, 0, 0, roll=roll))))
     for k in range(4):
         values = (np.zeros(9), m.vector(0.0, 0.1, 0.3), np.zeros(9), m.vector(0.0, 0.0, 9.8), np.zeros(9))
-        orientation = m.pose(0, 0, 0).orientation
+        orientation = m.pose(0, 0, 0.7, roll=roll, pitch=0.1).orientation  # the robot's nose is down
         made = m.make("sensor_msgs/msg/Imu", m.header(stamp(k), "gyro"), orientation, *values)
         entries.append(("/imu/data", stamp(k), made))
     with open_recording([m.write_mcap(tmp_path / "a.mcap", sorted(entries, key=lambda entry: entry[1]))]) as recording:
         topics = choose_topics(recording)
-        found = [each for each in scan_stream(recording, topics) if isinstance(each, YawRate)]
+        found = [each for each in scan_stream(recording, topics) if isinstance(each, ImuReading)]
         assert topics.imu == "/imu/data" and "IMU: /imu/data (10.0 Hz)" in describe_lidar(recording, topics).lines()
         assert choose_topics(recording, TopicArguments(imu="none")).imu is None
     assert [each.stamp_ns for each in found] == [stamp(k) for k in range(4)]
     assert [each.rate_rps for each in found] == pytest.approx([rate] * 4)
+    assert found[0].up is not None
+    np.testing.assert_allclose(found[0].up, [-math.sin(0.1), 0.0, math.cos(0.1)], atol=1e-9)
 
 
 def test_a_direction_that_is_given_leaves_the_scanner_its_place(tmp_path: Path) -> None:

@@ -1,4 +1,4 @@
-"""A recording as scans, wheel poses and yaw rates in order of time, for estimators that use them."""
+"""A recording as scans, wheel poses and readings of an IMU in order of time, for estimators that use them."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import numpy as np
 
 from ngo_recordings.association import RESTART_NS, header_stamp_ns
 from ngo_recordings.errors import RecordingError
-from ngo_recordings.imu import recorded_up_axis, yaw_rate
+from ngo_recordings.imu import recorded_pose, up_axis, up_direction, yaw_rate
 from ngo_recordings.laser_scan import LEAST_INCREMENT, LidarScan, is_increment
 from ngo_recordings.odometry_poses import OdometryPoses
 from ngo_recordings.recording import Message, Recording
@@ -19,7 +19,7 @@ from ngo_recordings.space_scan import scan_reader
 from ngo_recordings.topics import RecordingTopics, WheelSource, transform_topics
 from ngo_recordings.transform_buffer import FramePoses, TransformBuffer
 
-__all__ = ["BAD_SCAN", "BAD_WHEELS", "LidarScan", "WheelPose", "YawRate", "scan_stream", "wheel_poses"]
+__all__ = ["BAD_SCAN", "BAD_WHEELS", "ImuReading", "LidarScan", "WheelPose", "scan_stream", "wheel_poses"]
 
 BAD_SCAN = "damaged scan"
 BAD_WHEELS = "wheel pose that is no number"
@@ -40,11 +40,13 @@ class WheelPose:
 
 
 @dataclass(frozen=True)
-class YawRate:
-    """Turn rate of an IMU about the robot's z, counter-clockwise, ``rate_rps``: rad/s."""
+class ImuReading:
+    """Turn rate of an IMU about the robot's z, counter-clockwise, ``rate_rps``: rad/s; and the world's ``up`` in the
+    robot's axes ``(3,)``, None where the IMU does not know it."""
 
     stamp_ns: int
     rate_rps: float
+    up: np.ndarray | None = None
 
 
 def scan_stream(
@@ -53,7 +55,7 @@ def scan_stream(
     angle_increment: float | None = None,
     skipped: Counter[str] | None = None,
     wheels_ahead_s: float | None = None,
-) -> Iterator[LidarScan | WheelPose | YawRate]:
+) -> Iterator[LidarScan | WheelPose | ImuReading]:
     """Scans of topics.scans, poses of topics.wheels and rates of topics.imu in order of their stamps; at equal stamps
     scans come last.
 
@@ -77,20 +79,22 @@ def scan_stream(
     names = {*topics.scans, *(wheels.names if wheels is not None else ())}
     if topics.imu is not None:
         names.add(topics.imu)
-        up = recorded_up_axis(recording, topics)
+        imu_pose = recorded_pose(recording, topics)
+        up = up_axis(imu_pose)
     lost: Counter[str] = Counter() if skipped is None else skipped
-    waiting: list[tuple[int, bool, int, int, LidarScan | WheelPose | YawRate]] = []
+    waiting: list[tuple[int, bool, int, int, LidarScan | WheelPose | ImuReading]] = []
     newest: dict[str, int] = {}
     late: dict[bool, int] = {}
     ahead_ns = 0 if wheels_ahead_s is None else round(wheels_ahead_s * 1e9)
     for order, message in enumerate(recording.messages(names)):
         is_scan = message.topic in topics.scans
         try:
-            found: list[LidarScan | WheelPose | YawRate]
+            found: list[LidarScan | WheelPose | ImuReading]
             if is_scan:
                 found = [readers[message.topic](message.value)]
             elif message.topic == topics.imu:
-                found = [YawRate(header_stamp_ns(message.value), yaw_rate(message.value, up))]
+                rate_rps, direction = yaw_rate(message.value, up), up_direction(message.value, imu_pose)
+                found = [ImuReading(header_stamp_ns(message.value), rate_rps, direction)]
             else:
                 found = list(wheels.read(message, lost) if wheels else ())
         except AttributeError as error:
@@ -109,7 +113,7 @@ def scan_stream(
                     yield heapq.heappop(waiting)[-1]
                 newest.clear()
             newest[message.topic] = max(record.stamp_ns, newest.get(message.topic, 0))
-            if not isinstance(record, YawRate):
+            if not isinstance(record, ImuReading):
                 late.setdefault(is_scan, record.stamp_ns - message.log_time_ns)
             apart_ns = late[False] - late[True] if len(late) == 2 else 0
             if wheels_ahead_s is None and abs(apart_ns) > _OTHER_CLOCK_NS:

@@ -66,11 +66,13 @@ class ScanPointsConfig:
 
 @dataclass(frozen=True, eq=False)
 class Mounting:
-    """Where the sensor sits: its pose ``sensor_xyyaw`` ``(3,)`` in the base frame, and whether it is ``upside_down``
-    (rolled by half a turn: its counter-clockwise is clockwise seen from above)."""
+    """Where the sensor sits: its pose ``sensor_xyyaw`` ``(3,)`` in the base frame, whether it is ``upside_down``
+    (rolled by half a turn: its counter-clockwise is clockwise seen from above), and its height above the base frame
+    ``height_m``, 0 where that is not known."""
 
     sensor_xyyaw: Array
     upside_down: bool = False
+    height_m: float = 0.0
 
     def __post_init__(self) -> None:
         if self.sensor_xyyaw.shape != (3,) or not np.isfinite(self.sensor_xyyaw).all():

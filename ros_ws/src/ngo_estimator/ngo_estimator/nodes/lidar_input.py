@@ -24,7 +24,7 @@ from ngo_estimator.nodes.status import NodeStatus
 from ngo_estimator.nodes.weights import load_core
 from ngo_estimator.offline.compiling import compiling
 from ngo_estimator.offline.warm_up import warm_up_odometry
-from ngo_recordings.imu import up_axis, yaw_rate
+from ngo_recordings.imu import up_axis, up_direction, yaw_rate
 from ngo_recordings.laser_scan import LidarScan, scan_of
 from ngo_recordings.mounting import Mounting as KnownMounting
 from ngo_recordings.mounting import mounting_in
@@ -85,7 +85,8 @@ class LidarInput:
     def _on_imu(self, message: Imu) -> None:
         frame = message.header.frame_id.strip("/")
         pose = self._robot.transforms.newest_lookup(self._robot.base_frame, frame)
-        self._core.add_imu(messages.to_ns(message.header.stamp), yaw_rate(message, up_axis(pose)))
+        stamp_ns, rate_rps = messages.to_ns(message.header.stamp), yaw_rate(message, up_axis(pose))
+        self._core.add_imu(stamp_ns, rate_rps, up_direction(message, pose))
 
     def _on_transforms(self, static: bool) -> None:
         for frame, known in list(self._mountings.items()):
@@ -197,7 +198,7 @@ class LidarInput:
         sensor = np.zeros(3) if found is None else found.base_from_scan_xyyaw.copy()
         if self._settings.scan_yaw_deg != 0.0 and frame == next(iter(self._mountings), frame):
             sensor[2] = math.radians(self._settings.scan_yaw_deg)
-        return Mounting(sensor, found is not None and found.upside_down)
+        return Mounting(sensor) if found is None else Mounting(sensor, found.upside_down, found.height_m)
 
     def reset(self) -> str:
         """Start anew with the next scan; returns what that means, in words."""

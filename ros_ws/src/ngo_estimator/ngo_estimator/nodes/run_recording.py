@@ -315,7 +315,7 @@ def _lidar(arguments: Arguments, folder: Path, recording: Recording, console: Co
         found = described.mounting if frame == first_frame else find_mounting(recording, topics, frame)
         if frame != first_frame and found is not None:
             console.print(f"another scanner: {found}", soft_wrap=True, highlight=False)
-        return None if found is None else Mounting(found.base_from_scan_xyyaw, found.upside_down)
+        return None if found is None else Mounting(found.base_from_scan_xyyaw, found.upside_down, found.height_m)
 
     truth = Truth()
     if topics.ground_truth is not None:

@@ -31,7 +31,7 @@ def lidar_lines(recording: Recording, topics: RecordingTopics) -> list[str]:
             lines.append(f"another scanner: {found}")
         if found is None:
             return Mounting(np.zeros(3)) if frame == described.scan_frame else None
-        return Mounting(found.base_from_scan_xyyaw, found.upside_down)
+        return Mounting(found.base_from_scan_xyyaw, found.upside_down, found.height_m)
 
     run = LidarRun(MixtureLidar(), ScanTrajectory(), mounting_of)
     skipped: Counter[str] = Counter()

@@ -15,9 +15,9 @@ from ngo_estimator.offline.recorded import RecordedRun, RecordedStep, Truth
 from ngo_estimator.slam.scan_trajectory import ScanTrajectory
 from ngo_estimator.slam.trajectory_update import Trajectory
 from ngo_estimator.trajectory.files import seconds
-from ngo_recordings.scan_stream import LidarScan, WheelPose, YawRate
+from ngo_recordings.scan_stream import ImuReading, LidarScan, WheelPose
 
-LidarRecord = LidarScan | WheelPose | YawRate
+LidarRecord = LidarScan | WheelPose | ImuReading
 
 _REASONS: dict[type[ValueError], str] = {
     DuplicateFrame: "the stamp came twice",
@@ -128,8 +128,8 @@ class LidarRun:
             with suppress(ValueError):
                 if isinstance(record, WheelPose):
                     self._odometry.add_wheels(record.stamp_ns, record.pose_xyyaw)
-                elif isinstance(record, YawRate):
-                    self._odometry.add_imu(record.stamp_ns, record.rate_rps)
+                elif isinstance(record, ImuReading):
+                    self._odometry.add_imu(record.stamp_ns, record.rate_rps, record.up)
                 else:
                     scans += 1
                     self._odometry.add_scan(record)
@@ -154,8 +154,8 @@ class LidarRun:
                     self._odometry.add_wheels(record.stamp_ns, record.pose_xyyaw)
                 except ValueError as error:
                     self._reject("wheel pose not usable", f"{seconds(record.stamp_ns)} s: {error}")
-            elif isinstance(record, YawRate):
-                self._odometry.add_imu(record.stamp_ns, record.rate_rps)
+            elif isinstance(record, ImuReading):
+                self._odometry.add_imu(record.stamp_ns, record.rate_rps, record.up)
             else:
                 self.frames += 1
                 restarts = self._odometry.restarts

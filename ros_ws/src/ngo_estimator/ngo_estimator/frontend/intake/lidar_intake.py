@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 
 from ngo_estimator.data.relative_step import LARGEST_ODOMETRY
+from ngo_estimator.frontend.intake.floor_rays import FloorRays
 from ngo_estimator.frontend.intake.imu_turns import ImuTurns
 from ngo_estimator.frontend.intake.mounting_yaw import MountingYaw
 from ngo_estimator.frontend.intake.scanner import Scanner
@@ -43,6 +44,7 @@ class LidarIntake:
         self._scanners: dict[str, Scanner] = {}
         self._clock = WheelClock()
         self._imu = ImuTurns()
+        self._floor = FloorRays()
         self.reset()
 
     def reset(self) -> None:
@@ -98,9 +100,12 @@ class LidarIntake:
             self._waiting_wheels.append(wheels)
         self._hand_on_wheels()
 
-    def add_imu(self, stamp_ns: int, yaw_rate_rps: float) -> None:
-        """Take an IMU's yaw rate about the robot's z."""
+    def add_imu(self, stamp_ns: int, yaw_rate_rps: float, up: Array | None = None) -> None:
+        """Take an IMU's yaw rate about the robot's z, and the world's up in the robot's axes ``(3,)`` where it knows
+        it."""
         self._imu.add(stamp_ns, yaw_rate_rps)
+        if up is not None:
+            self._floor.add(stamp_ns, up)
         self._hand_on_wheels()
 
     def _hand_on_wheels(self, at_end: bool = False) -> None:
@@ -129,6 +134,7 @@ class LidarIntake:
             return
         corrected = self._scanners[scanner].correct(scan, self._min_range_m)
         if corrected is not None:
+            corrected = self._floor.without(corrected, mounting)
             self._hand_on(self._turns.add(Part(corrected, mounting, scanner)))
 
     def remount(self) -> None:
@@ -214,7 +220,7 @@ class LidarIntake:
         lines += [line for name, scanner in self._scanners.items() for line in scanner.remarks(name)]
         lines += self._clock.truth.remarks()
         lines += ["the wheels' pose stays while the robot drives: left out meanwhile"] if self._wheels.froze else []
-        lines += [line] if (line := self._imu.remark()) else []
+        lines += [line for told in (self._imu, self._floor) if (line := told.remark())]
         for name, stray in (("scans", self._stray_scans), ("wheels", self._stray_wheels)):
             if stray.left_out:
                 lines.append(f"{stray.left_out} of the {name} are stamped far from those before and after: left out")
