@@ -250,6 +250,20 @@ def test_a_scanner_that_hangs_upside_down_is_seen(tmp_path: Path, yaw: float) ->
     np.testing.assert_allclose(found.base_from_scan_xyyaw, [0.2, 0.0, yaw], atol=1e-9)
 
 
+def test_of_a_mounting_that_changes_the_one_that_holds_longest_counts(tmp_path: Path) -> None:
+    entries = drive(20)
+    for at, x in ((1, 5.0), (stamp(0.0), 0.3), (stamp(15.0), 0.9), (stamp(18.0), 0.3)):
+        entries.append(("/tf_static", at, m.transforms(static("base_link", "laser", x, 0.0, 0.0))))
+    with open_recording([m.write_mcap(tmp_path / "a.mcap", sorted(entries, key=lambda entry: entry[1]))]) as recording:
+        found = find_mounting(recording, WITH_WHEELS)
+    assert found is not None and found.base_from_scan_xyyaw[0] == pytest.approx(5.0)
+    entries = [entry for entry in entries if entry[1] > 1]
+    with open_recording([m.write_mcap(tmp_path / "b.mcap", sorted(entries, key=lambda entry: entry[1]))]) as recording:
+        found = find_mounting(recording, WITH_WHEELS)
+    assert found is not None and found.base_from_scan_xyyaw[0] == pytest.approx(0.3)
+    assert "it changes on the way" in str(found)
+
+
 def test_a_tilt_is_stated(tmp_path: Path) -> None:
     found = mounted(
         tmp_path / "a.mcap", ("/tf_static", 1, m.transforms(static("base_link", "laser", 0, 0, 0, pitch=0.3)))

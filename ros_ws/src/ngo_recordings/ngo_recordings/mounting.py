@@ -85,7 +85,8 @@ def find_pose(
 ) -> tuple[str, str, Pose, str] | None:
     """The robot's frame, that of a sensor (None: of topics.image), the sensor's pose there, and which topics say it.
 
-    Chains of transforms are composed. Those of /tf_static count; where they do not join the two frames, the first
+    Chains of transforms are composed. Those of /tf_static count, of a frame whose transform changes the one that holds
+    longest; where they do not join the two frames, the first
     transforms of /tf (10 min of it) are taken, without those that move the robot itself. The robot's frame is the child
     of the wheel odometry, else base_link, base_footprint or base, with the robot's prefix where it has one. Topics of
     transforms in another robot's namespace are left out. None where no transform says it.
@@ -98,10 +99,13 @@ def find_pose(
     tree = TransformBuffer()
     names = transform_topics(recording, topics.image)
     static = [name for name in names if name.endswith("static")]
-    for _, each in _transforms(recording, static):
-        tree.take((each,), static=True)
+    held, changed = _held_longest(recording, static, recording.topics[topics.image].last_ns)
+    tree.take(held, static=True)
     if (found := _lookup(tree, bases, scan_frame)) is not None:
-        return found[0], scan_frame, found[1], ", ".join(static)
+        source = ", ".join(static)
+        if changed & set(tree.between(found[0], scan_frame)):
+            source += ", as it was said for the longest time: it changes on the way"
+        return found[0], scan_frame, found[1], source
     moving = [name for name in names if name not in static]
     known = set(tree.frames())
     start_ns: int | None = None
@@ -146,6 +150,26 @@ def _transforms(recording: Recording, names: list[str]) -> Iterator[tuple[int, A
     for message in recording.messages(names):
         for each in message.value.transforms:
             yield message.log_time_ns, each
+
+
+def _held_longest(recording: Recording, names: list[str], end_ns: int) -> tuple[list[Any], set[str]]:
+    """Of each frame the static transform that holds for the longest time, and the frames of which there are several."""
+    said: dict[str, list[tuple[int, Any]]] = {}
+    for log_time_ns, each in _transforms(recording, names):
+        said.setdefault(each.child_frame_id.strip("/"), []).append((log_time_ns, each))
+    held, changed = [], set()
+    for child, all_said in said.items():
+        times_ns = [time_ns for time_ns, _ in all_said]
+        total: dict[str, int] = {}
+        last: dict[str, Any] = {}
+        for (time_ns, each), until_ns in zip(all_said, [*times_ns[1:], max(end_ns, times_ns[-1] + 1)], strict=True):
+            value = f"{each.header.frame_id} {each.transform}"
+            total[value] = total.get(value, 0) + until_ns - time_ns
+            last[value] = each
+        held.append(last[max(total, key=lambda value: total[value])])
+        if len(total) > 1:
+            changed.add(child)
+    return held, changed
 
 
 def _lookup(tree: TransformBuffer, bases: list[str], scan_frame: str) -> tuple[str, Pose] | None:

@@ -9,11 +9,12 @@ import pytest
 from ngo_estimator.frontend.intake.imu_turns import ImuTurns
 from ngo_estimator.frontend.intake.no_return import NoReturnValues
 from ngo_estimator.frontend.intake.scanner import Scanner
+from ngo_estimator.frontend.intake.single_wheels import SingleWheels
 from ngo_estimator.frontend.intake.turns import Part, together
 from ngo_estimator.frontend.intake.wheel_clock import CorrectedWheels, WheelTruth
 from ngo_estimator.geometry.planar_motion import Array, between, compose
 from ngo_estimator.geometry.scan_points import Mounting
-from ngo_recordings.scan_stream import LidarScan
+from ngo_recordings.scan_stream import LidarScan, WheelPose
 from tests.unit.ngo_estimator.ray_casting import ROOM, cast
 
 RAYS = 360
@@ -154,3 +155,24 @@ def test_wheels_of_a_robot_that_stands_count() -> None:
         wheels.add(k * 10**9, np.zeros(3), WheelTruth())
         wheels.moved(np.array((0.004 * (-1) ** k, 0.0, 0.0)))  # a match is never exact
     assert not wheels.frozen and wheels.motion(10**9, 2 * 10**9) is not None
+
+
+def poses_of(offset: Array, count: int, begin: int = 0) -> list[WheelPose]:
+    """Of an odometry that began elsewhere."""
+    path = [np.array((0.1 * k, 0.02 * k, 0.01 * k)) for k in range(begin, begin + count)]
+    return [WheelPose((begin + k) * 10**8, compose(offset, pose)) for k, pose in enumerate(path)]
+
+
+def test_of_two_odometries_on_a_topic_the_first_counts() -> None:
+    first, second, single = poses_of(np.zeros(3), 40), poses_of(np.array((5.0, 3.0, 1.0)), 40), SingleWheels()
+    mixed = [each for pair in zip(first, second, strict=True) for each in pair]
+    found = [kept for each in mixed for kept in single.add(each)]
+    assert found == first and "of another odometry on the same topic" in single.remark()
+    late = poses_of(np.array((5.0, 3.0, 1.0)), 40, begin=60)  # the first one ends
+    assert [kept for each in late for kept in single.add(each)] == late
+
+
+def test_an_odometry_that_begins_anew_goes_on() -> None:
+    single, before, after = SingleWheels(), poses_of(np.zeros(3), 10), poses_of(np.array((5.0, 3.0, 1.0)), 10, begin=10)
+    assert [kept for each in (*before, *after) for kept in single.add(each)] == [*before, *after]
+    assert single.remark() == ""

@@ -175,6 +175,14 @@ def test_deskew_helps_a_robot_that_turns() -> None:
     assert found[1] < 0.1 * found[0]
 
 
+def test_the_first_scan_is_deskewed_by_the_wheels() -> None:
+    """Else its bend, of half a sweep's turn, stays in the path."""
+    poses, _, swept = swept_scans([math.radians(8.0)] * 12)
+    steps = fed(MixtureLidar(), [record for pair in zip(wheels(poses), swept, strict=False) for record in pair])
+    errors = [between(between(poses[0], p), step.odom_xyyaw) for p, step in zip(poses[1:], steps, strict=False)]
+    assert len(steps) == 11 and np.abs(errors).max() < 0.01
+
+
 def errors_of_slipping_wheels(poses: np.ndarray, scans: list[LidarScan], slips_rad: list[float]) -> np.ndarray:
     """Errors ``(steps, 3)`` of the poses that scans get whose wheels turn by so much more from each to the next."""
     slipped = [poses[0]]

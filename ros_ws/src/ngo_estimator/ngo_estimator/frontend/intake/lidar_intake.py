@@ -11,6 +11,7 @@ from ngo_estimator.frontend.intake.floor_rays import FloorRays
 from ngo_estimator.frontend.intake.imu_turns import ImuTurns
 from ngo_estimator.frontend.intake.mounting_yaw import MountingYaw
 from ngo_estimator.frontend.intake.scanner import Scanner
+from ngo_estimator.frontend.intake.single_wheels import SingleWheels
 from ngo_estimator.frontend.intake.stray_stamps import StrayStamps
 from ngo_estimator.frontend.intake.turns import Part, Turns
 from ngo_estimator.frontend.intake.wheel_clock import CorrectedWheels, WheelClock, WheelTruth
@@ -53,6 +54,7 @@ class LidarIntake:
         self._turns = Turns()
         self._stray_scans: StrayStamps[LidarScan] = StrayStamps()
         self._stray_wheels: StrayStamps[WheelPose] = StrayStamps()
+        self._single_wheels = SingleWheels()
         self._mountings: dict[str, Mounting | None] = {}
         for scanner in self._scanners.values():
             scanner.sweep.interrupt()
@@ -95,9 +97,10 @@ class LidarIntake:
         """Take the wheels' pose ``(3,)``; raises ``ValueError`` as the front end does."""
         if pose_xyyaw.shape != (3,) or not (np.abs(pose_xyyaw) <= LARGEST_ODOMETRY).all():
             raise ValueError(f"the wheels' pose is {pose_xyyaw}; expected three numbers up to {LARGEST_ODOMETRY:g}")
-        for wheels in self._stray_wheels.add(WheelPose(stamp_ns, pose_xyyaw)):
-            self._clock.add_wheels(wheels.stamp_ns, wheels.pose_xyyaw)
-            self._waiting_wheels.append(wheels)
+        for each in self._stray_wheels.add(WheelPose(stamp_ns, pose_xyyaw)):
+            for wheels in self._single_wheels.add(each):
+                self._clock.add_wheels(wheels.stamp_ns, wheels.pose_xyyaw)
+                self._waiting_wheels.append(wheels)
         self._hand_on_wheels()
 
     def add_imu(self, stamp_ns: int, yaw_rate_rps: float, up: Array | None = None) -> None:
@@ -220,7 +223,7 @@ class LidarIntake:
         lines += [line for name, scanner in self._scanners.items() for line in scanner.remarks(name)]
         lines += self._clock.truth.remarks()
         lines += ["the wheels' pose stays while the robot drives: left out meanwhile"] if self._wheels.froze else []
-        lines += [line for told in (self._imu, self._floor) if (line := told.remark())]
+        lines += [line for told in (self._single_wheels, self._imu, self._floor) if (line := told.remark())]
         for name, stray in (("scans", self._stray_scans), ("wheels", self._stray_wheels)):
             if stray.left_out:
                 lines.append(f"{stray.left_out} of the {name} are stamped far from those before and after: left out")

@@ -11,6 +11,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ngo_estimator.frontend.intake.imu_turns import ImuTurns
+from ngo_estimator.frontend.intake.single_wheels import is_possible
 from ngo_estimator.geometry.planar_motion import Array, between, compose, wrap
 
 _CELL_S = 0.05
@@ -50,10 +51,6 @@ _SCALES = (0.7, 1.4)
 
 _LEAST_WAY_M = 2.0
 
-_FASTEST = (15.0, 10.0)
-_AT_ONCE = (0.5, 1.0)
-"""No robot goes or turns faster (m/s, rad/s), nor by more at once (m, rad): such a step is none of the robot's."""
-
 
 @dataclass(frozen=True)
 class WheelTruth:
@@ -79,7 +76,8 @@ class WheelTruth:
             side = "ahead of" if self.offset_s > 0.0 else "behind"
             lines.append(f"the wheels' clock is {abs(self.offset_s):.2f} s {side} the scans': corrected")
         if self.turn_scale != 1.0:
-            lines.append(f"the wheels' turns are taken times {self.turn_scale:.3g}, as the scans say")
+            why = "; or the scanner is upside down" if self.turn_scale < 0.0 else ""
+            lines.append(f"the wheels' turns are taken times {self.turn_scale:.3g}, as the scans say{why}")
         if self.way_scale != 1.0:
             lines.append(f"the wheels' ways are taken times {self.way_scale:.3g}, as the scans say")
         return lines
@@ -264,8 +262,7 @@ class CorrectedWheels:
             step = between(self._raw[-1][1], pose) * (truth.way_scale, turned, truth.turn_scale)
             elapsed_s = (stamp_ns - self._raw[-1][0]) * 1e-9
             step[2] = wrap(float(step[2]))
-            way, turn = math.hypot(step[0], step[1]), abs(step[2])
-            if way > _FASTEST[0] * elapsed_s + _AT_ONCE[0] or turn > _FASTEST[1] * elapsed_s + _AT_ONCE[1]:
+            if not is_possible(step, elapsed_s):
                 step, self._changed = np.zeros(3), True
             elif self._imu.used and step.any():
                 offset_ns = round(truth.offset_s * 1e9)

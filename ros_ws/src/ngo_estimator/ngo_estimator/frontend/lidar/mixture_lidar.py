@@ -1,5 +1,6 @@
 """The local estimator of a 2D lidar: scans and wheel odometry in, relative poses and key scans out (no ROS here)."""
 
+import math
 from collections import deque
 from collections.abc import Iterator
 from dataclasses import replace
@@ -182,7 +183,7 @@ class MixtureLidar:
     def _step(self, scan: LidarScan, at_s: float) -> LidarStep | None:
         last, gap_s = self._last, at_s - self._last_s
         if last is None:
-            key = self._key_scan(scan, None)
+            key = self._key_scan(scan, None if self._wheels is None else self._sweep(scan, at_s, math.inf))
             self._core.begin(key)
             self._origin, self._origin_ns, self._key_ns = key, key.stamp_ns, key.stamp_ns
             self._last, self._last_s = key, at_s

@@ -1,0 +1,63 @@
+"""The poses of one odometry where two publish on one topic or transform: steps that no robot makes tell them apart.
+
+An odometry that begins anew goes on from where it jumped to, and never comes back. So a pose that is out of reach waits
+for the next one.
+"""
+
+import math
+
+from ngo_estimator.geometry.planar_motion import Array, between
+from ngo_recordings.scan_stream import WheelPose
+
+_FASTEST = (15.0, 10.0)
+_AT_ONCE = (0.5, 1.0)
+"""No robot goes or turns faster (m/s, rad/s), nor by more at once (m, rad)."""
+
+_SILENT_NS = 1_000_000_000
+"""After so long without a pose the one that comes counts."""
+
+
+class SingleWheels:
+    """Hands on the poses of the odometry that was heard first."""
+
+    def __init__(self) -> None:
+        self.left_out = 0
+        """How many poses are of another odometry."""
+        self._last: WheelPose | None = None
+        self._other: WheelPose | None = None
+        self._beside = False  # whether the last one went on since the other was heard
+
+    def add(self, wheels: WheelPose) -> list[WheelPose]:
+        """Take a pose; returns those that are to be used by now."""
+        last, other = self._last, self._other
+        if last is None or not abs(wheels.stamp_ns - last.stamp_ns) < _SILENT_NS or _goes_on(last, wheels):
+            self._last, self._beside = wheels, True
+            return [wheels]
+        self._other = wheels
+        if other is None or not _goes_on(other, wheels):
+            self._beside = False
+            return []
+        if self._beside:
+            self.left_out += 1
+            return []
+        self._last, self._other = wheels, None
+        return [other, wheels]
+
+    def remark(self) -> str:
+        """In words; nothing where there is one odometry."""
+        return (
+            f"{self.left_out} poses of the wheels are of another odometry on the same topic: left out"
+            if self.left_out
+            else ""
+        )
+
+
+def is_possible(step: Array, elapsed_s: float) -> bool:
+    """Whether a robot moves by a step ``(3,)`` within a time."""
+    way, turn = math.hypot(step[0], step[1]), abs(math.remainder(step[2], math.tau))
+    return way <= _FASTEST[0] * elapsed_s + _AT_ONCE[0] and turn <= _FASTEST[1] * elapsed_s + _AT_ONCE[1]
+
+
+def _goes_on(before: WheelPose, after: WheelPose) -> bool:
+    elapsed_s = max(after.stamp_ns - before.stamp_ns, 0) * 1e-9
+    return is_possible(between(before.pose_xyyaw, after.pose_xyyaw), elapsed_s)
