@@ -73,6 +73,18 @@ def test_derivatives_are_those_of_the_errors() -> None:
     np.testing.assert_allclose((there - errors) / step, by_inverse, atol=1e-5)
 
 
+def test_rays_that_are_less_sure_do_not_turn_the_pose_together() -> None:
+    first, second, model = seen("plumb_bob", points(60))
+    second[:30] += 0.01 * np.array((-second[:30, 1], second[:30, 0], np.zeros(30))).T  # half, all in one sense
+    second /= np.linalg.norm(second, axis=1, keepdims=True)
+    anywhere, turns = (MOTION, np.diag((1e2, 1e2, 1.0))), []
+    for std in (np.full(60, 1e-3), np.where(np.arange(60) < 30, 1e-2, 1e-3)):
+        ranged = unmeasured(model.centre, first, 0.25)
+        turns.append(fit_view(ranged, second, std, model.centre, MOTION + 0.01, anywhere, 1e-3, 1e-3).pose[2])
+    off = np.abs(np.array(turns) - MOTION[2])
+    assert off[1] < 1e-3 and off[0] > 2.0 * off[1]
+
+
 def test_known_ranges_tell_the_scale_and_unknown_ones_leave_it_to_the_prior() -> None:
     where = points(40)
     first, second, model = seen("plumb_bob", where)

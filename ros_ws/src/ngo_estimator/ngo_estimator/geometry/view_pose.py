@@ -11,6 +11,7 @@ from dataclasses import dataclass, fields, replace
 import numpy as np
 
 from ngo_estimator.geometry.se2 import wrap
+from ngo_estimator.geometry.view_kernel import add_rays, all_terms, nearest_ranges
 
 Array = np.ndarray
 
@@ -25,7 +26,6 @@ UNKNOWN_STD = 3.0
 _RANGED = 0.3
 """A range is known where its deviation is less than this share of it."""
 
-_INVERSE_LIMITS = (1e-3, 10.0)
 _NO_SLOPE = 1e-12
 _TRIANGULATIONS = 3
 _MISSED = 6.0
@@ -95,13 +95,6 @@ def unmeasured(origin: Array, rays: Array, inverse: float) -> RangedRays:
     return RangedRays(np.tile(origin, (count, 1)), rays, np.full(count, inverse), np.full(count, UNKNOWN_STD))
 
 
-def _tangents(rays: Array) -> Array:
-    """Two unit vectors across each ray ``(n, 2, 3)``, one of them level."""
-    level = np.stack((-rays[:, 1], rays[:, 0], np.zeros(len(rays))), axis=1)
-    level /= np.maximum(np.linalg.norm(level, axis=1, keepdims=True), 1e-9)
-    return np.stack((level, np.cross(rays, level)), axis=1)
-
-
 def ray_errors(points: RangedRays, seen: Array, pose: Array, centre: Array) -> tuple[Array, Array, Array]:
     """Errors of rays that see points from a pose, and how they change.
 
@@ -112,34 +105,16 @@ def ray_errors(points: RangedRays, seen: Array, pose: Array, centre: Array) -> t
         Errors ``(n, 2)`` (rad), their derivatives by the pose and the camera's height ``(n, 2, 4)``, and by the inverse
         range ``(n, 2)``.
     """
-    vectors = base_vectors(points, pose, centre)
-    length = np.maximum(np.linalg.norm(vectors, axis=1), 1e-9)
-    unit = vectors / length[:, None]
-    across = _tangents(seen)
-    errors = np.einsum("nkj,nj->nk", across, unit)
-    # Of the unit vector, by the vector: what is not along it, over its length.
-    slope = (across - errors[:, :, None] * unit[:, None, :]) / length[:, None, None]
-    cos, sin = np.cos(pose[2]), np.sin(pose[2])
-    back = np.array(((cos, sin, 0.0), (-sin, cos, 0.0), (0.0, 0.0, 1.0)))
-    moved = np.zeros((len(points), 3, 4))
-    moved[:, :, :2] = -points.inverse[:, None, None] * back[None, :, :2]
-    lever = np.array((-centre[1], centre[0], 0.0))  # how the camera moves in base axes when the base turns
-    moved[:, 0, 2], moved[:, 1, 2] = vectors[:, 1], -vectors[:, 0]
-    moved[:, :, 2] -= points.inverse[:, None] * lever
-    moved[:, 2, 3] = -points.inverse
-    by_pose = slope @ moved
-    by_inverse = np.einsum("nkj,nj->nk", slope, (points.origins - camera_at(pose, centre)) @ back.T)
-    return errors, by_pose, by_inverse
+    result: tuple[Array, Array, Array] = all_terms(
+        points.origins, points.rays, points.inverse, seen, pose, centre.copy()
+    )
+    return result
 
 
 def triangulated(points: RangedRays, seen: Array, pose: Array, centre: Array, inverse: Array, steps: int = 1) -> Array:
     """Inverse ranges ``(n,)`` of points that suit rays ``(n, 3)`` from a pose best, by so many Newton steps."""
-    for _ in range(steps):
-        now = RangedRays(points.origins, points.rays, inverse, points.inverse_std)
-        errors, _, by_inverse = ray_errors(now, seen, pose, centre)
-        slope = np.maximum((by_inverse**2).sum(1), _NO_SLOPE)
-        inverse = np.clip(inverse - (by_inverse * errors).sum(1) / slope, *_INVERSE_LIMITS)
-    return inverse
+    found: Array = nearest_ranges(points.origins, points.rays, inverse, seen, pose, centre.copy(), steps)
+    return found
 
 
 def measured_ranges(
@@ -186,39 +161,19 @@ def fit_view(
     """
     mean, information = prior
     state = np.append(start, (0.0, 0.0))  # x, y, yaw; rise; share of the scale
-    unknown = points.inverse_std > _RANGED * points.inverse
-    inverse = points.inverse.copy()
+    unknown, inverse = points.inverse_std > _RANGED * points.inverse, points.inverse.copy()
     nuisances = np.array((rise_std, scale_std)) ** -2.0
     for _ in range(_ITERATIONS):
-        at = centre + (0.0, 0.0, state[3])
-        # A range that nobody knows is the one that suits the pose best: it must not pull.
-        inverse[unknown] = triangulated(points[unknown], seen[unknown], state[:3], at, inverse[unknown])
-        scaled = RangedRays(points.origins, points.rays, inverse * (1.0 + state[4] * ~unknown), points.inverse_std)
-        errors, by_pose, by_inverse = ray_errors(scaled, seen, state[:3], at)
-        by_scale = (by_inverse * (inverse * ~unknown)[:, None])[..., None]
-        jacobian = np.concatenate((by_pose, by_scale), axis=2)
-        weight = _weights(by_inverse * points.inverse_std[:, None], std_rad)
-        squared = np.einsum("ni,nij,nj->n", errors, weight, errors)
-        robust = weight / (1.0 + squared / kernel**2)[:, None, None]
         off = np.append(state[:2] - mean[:2], wrap(state[2] - mean[2]))
-        normal, gradient = np.zeros((5, 5)), np.zeros(5)
-        normal[:3, :3], gradient[:3] = information, information @ off
-        normal[(3, 4), (3, 4)], gradient[3:] = nuisances, nuisances * state[3:]
-        turned = np.einsum("nij,njk->nik", robust, jacobian)
-        normal += np.einsum("nij,nik->jk", jacobian, turned)
-        gradient += np.einsum("nij,ni->j", turned, errors)
-        step = -np.linalg.solve(normal, gradient)
-        state += step
+        normal, gradient = np.zeros((5, 5)), np.append(information @ off, nuisances * state[3:])
+        normal[:3, :3], normal[(3, 4), (3, 4)] = information, nuisances
+        at = centre + (0.0, 0.0, state[3])
+        squared = add_rays(points.origins, points.rays, inverse, points.inverse_std, unknown, seen, std_rad, state, at,
+                           kernel, normal, gradient)  # fmt: skip
+        step = np.linalg.solve(normal, gradient)
+        state -= step
         state[4] = np.clip(state[4], -0.5, 0.5)
         if np.abs(step).max() < _SETTLED:
             break
     covariance = np.linalg.inv(normal)[:3, :3]
     return ViewPose(state[:3], covariance, squared < (1.5 * kernel) ** 2, float(state[3]), float(state[4]))
-
-
-def _weights(along: Array, std_rad: Array) -> Array:
-    """Information ``(n, 2, 2)`` of errors that are wide along ``(n, 2)``, on top of ``std_rad`` ``(n,)`` each way."""
-    variance = std_rad**2
-    shrunk = 1.0 / (variance * (variance + (along**2).sum(1)))
-    weights: Array = np.eye(2) / variance[:, None, None] - shrunk[:, None, None] * along[:, :, None] * along[:, None, :]
-    return weights

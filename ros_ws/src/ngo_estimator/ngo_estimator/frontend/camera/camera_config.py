@@ -11,8 +11,12 @@ class CameraConfig:
     corners: int = 220
     # Distance between two of them, as a share of the picture's width.
     apart: float = 0.02
-    # Standard deviation of where a corner is found, pixels.
-    pixel_std: float = 0.4
+    # Standard deviation of where a corner is found: pixels, and a share of its parallax, for patches that grow or turn
+    # are followed worse.
+    pixel_std: float = 0.1
+    parallax_std: float = 0.03
+    # The same in pixels for its range, whose measurements share the errors of one patch.
+    range_pixel_std: float = 0.4
     # Standard deviations of the given motion: a share of the way and of the turn, and per frame besides (m, rad).
     given_way_share: float = 0.03
     given_turn_share: float = 0.15

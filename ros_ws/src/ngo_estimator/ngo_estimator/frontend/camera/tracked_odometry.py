@@ -139,7 +139,7 @@ class TrackedOdometry:
         if len(self._points) < self._config.least_inliers:
             return alone
         seen = self._model.rays(self._pixels)
-        std_rad = np.full(len(seen), self._config.pixel_std * self._model.pixel_rad)
+        std_rad = self._deviations(seen, predicted)
         information = np.linalg.inv(covariance)
 
         def fit(start: Array, held: Array) -> ViewPose:
@@ -160,11 +160,19 @@ class TrackedOdometry:
             fitted = fit(mean, held)
             fitted = replace(fitted, covariance=_not_surer(fitted.covariance, covariance), scale=0.0)
             off[2] = wrap(fitted.pose[2] - mean[2])
-        self._seen, self._std_rad = seen, std_rad
+        self._seen = seen
         trusted = (
             fitted.inlier.sum() >= self._config.least_inliers and off[2] ** 2 < _MOST_SURPRISE**2 * covariance[2, 2]
         )
         return fitted if trusted else alone
+
+    def _deviations(self, seen: Array, predicted: Array) -> Array:
+        """Of rays ``(n,)``, rad: corners that moved far against what is far away are followed worse."""
+        parallax = np.linalg.norm(seen - self._from_rays @ _turn(predicted[2] - self._from[2]), axis=1)
+        deviations: Array = np.hypot(
+            self._config.pixel_std * self._model.pixel_rad, self._config.parallax_std * parallax
+        )
+        return deviations
 
     def _without_prior(self, seen: Array, mean: Array) -> Array | None:
         """A pose ``(3,)`` on which most rays agree, as far away as was given."""
@@ -213,7 +221,8 @@ class TrackedOdometry:
         points, here = self._points, camera_at(fitted.pose, self._centre_now)
         scaled = replace(points, inverse=points.inverse * (1.0 + fitted.scale))
         unknown_m = math.sqrt(np.trace(fitted.covariance[:2, :2])) if self._unknown.any() else 0.0
-        inverse, std = measured_ranges(scaled, self._seen, self._std_rad, fitted.pose, self._centre_now, unknown_m)
+        std_rad = np.full(len(points), self._config.range_pixel_std * self._model.pixel_rad)
+        inverse, std = measured_ranges(scaled, self._seen, std_rad, fitted.pose, self._centre_now, unknown_m)
         # From now on they are seen from here.
         vectors = points.rays + inverse[:, None] * (points.origins - here)
         nearer = 1.0 / np.maximum(np.linalg.norm(vectors, axis=1), _NEAREST)
