@@ -30,6 +30,8 @@ DISTRIBUTIONS = {
     "rerun": "rerun-sdk",
     "cv2": "opencv-python-headless",
 }
+# Keys of rosdep for libraries that Debian and Ubuntu have: with these alone the nodes of a robot with a lidar run.
+DEBIAN = {name: f"python3-{name.lower()}" for name in ("PIL", "matplotlib", "numba", "numpy", "scipy", "yaml")}
 OWN = {*PYTHON, *PROGRAMS, "ros2_stand_in"}
 ROS = ("rclpy", "ament_index_python", "launch", "launch_ros")
 VERSION = "0.1.0"
@@ -90,7 +92,8 @@ def test_a_package_declares_what_it_imports_and_no_more(name: str, monkeypatch: 
     imported = imports_below(folder)
     of_ros = {module for module in imported if is_of_ros(module) or module in SOURCES}
     forwarded = {"ngo_bringup"} if name != "ngo_bringup" else set()  # which depends on those that forward to it
-    assert declared_for_ros(folder) == of_ros | ros_packages_in_launch_files(folder) - forwarded - {name}
+    of_debian = {DEBIAN[module] for module in imported & set(DEBIAN)}
+    assert declared_for_ros(folder) == of_ros | of_debian | ros_packages_in_launch_files(folder) - forwarded - {name}
     of_pip = {module if module in SOURCES else distribution(module) for module in imported if not is_of_ros(module)}
     declared = setup_of(folder, monkeypatch)
     extras = declared["extras_require"]
@@ -103,6 +106,35 @@ def test_a_package_declares_what_it_imports_and_no_more(name: str, monkeypatch: 
     if name == "ngo_sim":  # which a robot does not need
         files.append("runtime.txt")
     assert needed <= required(*files), f"{files} have all that is imported"
+
+
+def imported_at_once(module: str, seen: set[str]) -> set[str]:
+    """Modules from elsewhere that importing one of the packages' modules imports, without those of Python itself."""
+    folder, _, rest = module.partition(".")
+    path = SOURCES[folder] / folder / rest.replace(".", "/")
+    path = path.with_suffix(".py") if path.with_suffix(".py").exists() else path / "__init__.py"
+    if module in seen or not path.exists():
+        return set()
+    seen.add(module)
+    tree = ast.parse(path.read_text())
+    tree.body = [each for each in tree.body if isinstance(each, ast.Import | ast.ImportFrom)]
+    names = imported_names(ast.unparse(tree), module)
+    own = {name for name in names if name.partition(".")[0] in PYTHON}
+    found = {name.partition(".")[0] for name in names - own} - set(sys.stdlib_module_names) - {"__future__"}
+    return found.union(*(imported_at_once(name, seen) for name in own))
+
+
+def test_nodes_of_a_lidar_start_with_what_debian_has() -> None:
+    """A library that only files need, or only pictures, is imported where it is used."""
+    nodes = ("local_node", "lidar_input", "ngo_node", "ngo_map", "map_layer")
+    starts = [*(f"ngo_estimator.nodes.{node}" for node in nodes), "ngo_explorer.nodes.explore_node"]
+    starts += [
+        "ngo_estimator.slam.scan_trajectory",
+        "ngo_estimator.slam.session",
+        "ngo_estimator.offline.warm_up_scans",
+    ]
+    found = set().union(*(imported_at_once(module, set()) for module in starts))
+    assert {module for module in found if not is_of_ros(module)} == set(DEBIAN) - {"matplotlib"}
 
 
 def test_programs_import_what_the_requirements_have() -> None:

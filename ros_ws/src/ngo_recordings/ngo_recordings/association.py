@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 from bisect import bisect_left, bisect_right
-from typing import Any, Generic, Protocol, TypeVar
+from typing import TYPE_CHECKING, Any, Generic, Protocol, TypeVar
 
 import numpy as np
 
 from ngo_recordings.errors import RecordingError
 from ngo_recordings.poses import Pose, PoseTrack, TransformTree, make_pose
-from ngo_recordings.recording import Message
+
+if TYPE_CHECKING:  # live nodes need no files
+    from ngo_recordings.recording import Message
 
 RESTART_NS = 1_000_000_000
 """Stamps that jump back this far belong to a source that restarted, as the estimators have it."""

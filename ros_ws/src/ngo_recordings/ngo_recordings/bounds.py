@@ -6,9 +6,6 @@ import bz2
 import stat
 from pathlib import Path
 
-import lz4.frame
-import zstandard
-
 from ngo_recordings.errors import RecordingError
 
 MAX_CHUNK_BYTES = 64 * 2**20
@@ -44,10 +41,14 @@ def unpacked(data: bytes, compression: str, most: int, declared: int | None = No
         raise ValueError(f"a chunk of {declared} bytes; expected at most {most}")
     wanted = (most if declared is None else declared) + 1  # one more shows that there is more
     if compression == "zstd":
+        import zstandard
+
         decompressor = zstandard.ZstdDecompressor(max_window_size=_MAX_WINDOW_BYTES)
         with decompressor.stream_reader(data) as reader:
             found = reader.read(wanted)
     elif compression == "lz4":
+        import lz4.frame
+
         found = lz4.frame.LZ4FrameDecompressor().decompress(data, max_length=wanted)
     elif compression == "bz2":
         found = bz2.BZ2Decompressor().decompress(data, max_length=wanted)

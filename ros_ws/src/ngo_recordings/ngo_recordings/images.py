@@ -8,7 +8,6 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from PIL import Image as Picture
 
 from ngo_recordings.errors import RecordingError
 
@@ -127,6 +126,8 @@ def _compressed(message: Any, topic: str, largest: tuple[int, int] | None) -> np
         raise RecordingError(
             f"images of {topic} have the format {message.format!r}; supported in CompressedImage: jpeg, png"
         )
+    from PIL import Image as Picture  # nodes of a lidar need no pictures
+
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", Picture.DecompressionBombWarning)  # a lower bound counts here

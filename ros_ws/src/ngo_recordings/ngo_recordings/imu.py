@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from ngo_recordings.mounting import find_pose
 from ngo_recordings.poses import Pose
-from ngo_recordings.recording import Recording
 from ngo_recordings.topics import RecordingTopics
+
+if TYPE_CHECKING:  # live nodes need no files
+    from ngo_recordings.recording import Recording
 
 _UP = np.array((0.0, 0.0, 1.0))
 

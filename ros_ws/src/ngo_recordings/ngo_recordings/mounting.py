@@ -5,16 +5,18 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from ngo_recordings.poses import Pose
-from ngo_recordings.recording import Recording
 from ngo_recordings.space_scan import is_optical
 from ngo_recordings.topics import RecordingTopics, transform_topics
 from ngo_recordings.transform_buffer import TransformBuffer, is_named
+
+if TYPE_CHECKING:  # live nodes need no files
+    from ngo_recordings.recording import Recording
 
 # Between these and the robot a transform moves: it says nothing of the robot itself.
 _OUTSIDE = ("odom", "map", "world", "earth")

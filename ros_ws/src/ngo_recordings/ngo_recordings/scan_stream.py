@@ -6,6 +6,7 @@ import heapq
 from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -14,10 +15,12 @@ from ngo_recordings.errors import RecordingError
 from ngo_recordings.imu import recorded_pose, up_axis, up_direction, yaw_rate
 from ngo_recordings.laser_scan import LEAST_INCREMENT, LidarScan, is_increment
 from ngo_recordings.odometry_poses import OdometryPoses
-from ngo_recordings.recording import Message, Recording
 from ngo_recordings.space_scan import scan_reader
 from ngo_recordings.topics import RecordingTopics, WheelSource, transform_topics
 from ngo_recordings.transform_buffer import FramePoses, TransformBuffer
+
+if TYPE_CHECKING:  # live nodes need no files
+    from ngo_recordings.recording import Message, Recording
 
 __all__ = ["BAD_SCAN", "BAD_WHEELS", "ImuReading", "LidarScan", "WheelPose", "scan_stream", "wheel_poses"]
 

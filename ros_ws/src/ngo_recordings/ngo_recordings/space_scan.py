@@ -8,7 +8,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from functools import partial
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -16,7 +16,9 @@ from ngo_recordings.association import header_stamp_ns
 from ngo_recordings.errors import RecordingError
 from ngo_recordings.images import CLOUD_TYPE, IMAGE_TYPE, SCAN_TYPE, picture
 from ngo_recordings.laser_scan import LidarScan, scan_of
-from ngo_recordings.recording import Recording
+
+if TYPE_CHECKING:  # live nodes need no files
+    from ngo_recordings.recording import Recording
 
 _RAYS = 1440
 _LOW_M, _HIGH_M = -0.2, 0.2

@@ -7,11 +7,14 @@ import re
 from collections.abc import Collection, Iterable
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from ngo_recordings.errors import RecordingError
 from ngo_recordings.images import CLOUD_TYPE, COMPRESSED_TYPE, DEPTH_ENCODINGS, IMAGE_TYPE, SCAN_TYPE, SENSOR_TYPES
-from ngo_recordings.recording import Recording
 from ngo_recordings.transform_buffer import TransformBuffer, is_named
+
+if TYPE_CHECKING:  # live nodes need no files
+    from ngo_recordings.recording import Recording
 
 ACTION_TYPE = "ngo_msgs/msg/DiscreteAction"
 ODOMETRY_TYPE = "nav_msgs/msg/Odometry"

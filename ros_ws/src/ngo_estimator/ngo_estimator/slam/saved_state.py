@@ -11,8 +11,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import safetensors
-from safetensors.numpy import load, save
 
 from ngo_common.files import PARTIAL, sync_names, write_whole
 from ngo_estimator.data.state_arrays import Arrays, StateError
@@ -32,6 +30,8 @@ def write_state(folder: Path, identity: Mapping[str, Any], arrays: Arrays) -> No
         StateError: the folder holds other files or a state of the other kind, or cannot be written.
     """
     # It writes the memory as it is.
+    from safetensors.numpy import save  # a node that saves nothing does without it
+
     content = save({name: np.require(array, requirements="C") for name, array in arrays.items()})
     digest = hashlib.sha256(content).hexdigest()
     name = f"arrays-{digest[:16]}.safetensors"
@@ -83,9 +83,12 @@ def read_state(folder: Path, identity: Mapping[str, Any]) -> Arrays:
     content = _read(arrays)
     if hashlib.sha256(content).hexdigest() != description["arrays_sha256"]:
         raise StateError(f"{arrays}: is damaged (its sha256 is not the one in {DESCRIPTION})")
+    from safetensors import SafetensorError
+    from safetensors.numpy import load
+
     try:
         return load(content)
-    except safetensors.SafetensorError as error:
+    except SafetensorError as error:
         raise StateError(f"{arrays}: is no safetensors file ({error})") from error
 
 
