@@ -18,7 +18,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from ngo_estimator.graph.corrector import CorrectedGraph, Corrector, GraphProblem, thresholds, truncated_cost
+from ngo_estimator.graph.corrector import CorrectedGraph, Corrector, GraphProblem, truncated_cost
 from ngo_estimator.graph.crowds import CrowdAware
 from ngo_estimator.graph.robust import Robust
 from training.baselines import graph_peers
@@ -43,7 +43,7 @@ PEERS: dict[str, graph_peers.Peer] = {
 }
 _OURS: dict[str, Callable[[], Corrector]] = {"robust": Robust, "robust_anew": Robust, "crowd_aware": CrowdAware}
 ROWS = ("odometry", *PEERS, *_OURS, "right_loops")
-_SOLVED = 1.5
+SOLVED = 1.5
 """A graph is solved where its error is below so many times that of the right loops."""
 
 _ROUNDING = 1.0 + 1e-6
@@ -154,7 +154,7 @@ def _measure(
         elif row in PEERS and not (row == "pcm" and problem.loops.degrees.min(initial=3) < 3):
             found[row] = graph_peers.within(PEERS[row], problem, limit_s)
     answers = {row: (problem.poses, float(limit_s)) if answer is None else answer for row, answer in found.items()}
-    bar = max(_SOLVED * judged.ate_m(answers["right_loops"][0]), judged.least_ate_m)
+    bar = max(SOLVED * judged.ate_m(answers["right_loops"][0]), judged.least_ate_m)
     numbers = {row: _numbers(judged, poses, seconds, bar) for row, (poses, seconds) in answers.items()}
     least = _ROUNDING * truncated_cost(problem, answers["right_loops"][0])
     for row, (poses, _) in answers.items():
@@ -179,8 +179,7 @@ def _measure_online(judged: JudgedProblem, rows: tuple[str, ...], limit_s: int) 
 
 def _numbers(judged: JudgedProblem, poses: np.ndarray, seconds: float, bar: float) -> dict[str, float]:
     """A loop counts as believed where the poses fit it within its threshold."""
-    loops = judged.problem.loops
-    believed = (loops.residuals(poses) ** 2).sum(1) <= thresholds(loops)
+    believed = judged.problem.fits(poses)
     ate = judged.ate_m(poses)
     return {
         "ate_m": ate,

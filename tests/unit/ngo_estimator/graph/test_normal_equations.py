@@ -6,9 +6,11 @@ import torch
 from torch import Tensor
 
 from ngo_estimator.geometry import se2
-from ngo_estimator.graph.block_cholesky import BlockCholesky, BlockStructure
+from ngo_estimator.graph.block_cholesky import BlockCholesky, BlockStructure, placed
+from ngo_estimator.graph.corrector import normal_equations
 from ngo_estimator.graph.gauss_newton import Factors, gauss_newton_step, node_covariance, pick
 from ngo_estimator.graph.normal_equations import GraphStructure, NormalEquations
+from tests.unit.ngo_estimator.graph.test_corrector import STD, loop, straight
 from tests.unit.ngo_estimator.graph.test_gauss_newton import BLOCKS, random_graph, with_whole_information
 from tests.unit.ngo_estimator.samples import optimized, small_optimizer, trajectory_inputs
 
@@ -22,7 +24,7 @@ def problem(count: int, loops: int, seed: int) -> tuple[np.ndarray, BlockStructu
     structure = BlockStructure(pairs, count)
     matrix, diagonal, lower = np.eye(3 * count), np.zeros((count, 3, 3)), np.zeros((structure.blocks, 3, 3))
     diagonal += np.eye(3)
-    place, first_is_row = structure.places(pairs)
+    ranks, place = placed(pairs, structure.rank, structure.starts, structure.rows)
     for k, pair in enumerate(pairs):
         jacobian = generator.normal(size=(3, 6))
         part = jacobian.T @ jacobian
@@ -30,7 +32,7 @@ def problem(count: int, loops: int, seed: int) -> tuple[np.ndarray, BlockStructu
         matrix[np.ix_(rows, rows)] += part
         diagonal[structure.rank[pair[0]]] += part[:3, :3]
         diagonal[structure.rank[pair[1]]] += part[3:, 3:]
-        lower[place[k]] += part[:3, 3:] if first_is_row[k] else part[3:, :3]
+        lower[place[k]] += part[:3, 3:] if ranks[k, 0] > ranks[k, 1] else part[3:, :3]
     return matrix, structure, diagonal, lower
 
 
@@ -65,8 +67,15 @@ def test_a_matrix_that_is_not_positive_definite_is_refused() -> None:
 def test_rows_and_pairs_that_are_not_there_are_refused() -> None:
     with pytest.raises(ValueError, match="pairs join rows 0 to 5; expected 0 to 4"):
         BlockStructure(np.array([[0, 5]]), 5)
-    with pytest.raises(ValueError, match="a pair has no block"):
-        BlockStructure(np.array([[0, 1], [2, 3]]), 4).places(np.array([[0, 3]]))
+    steps = straight(3, loop(3.0, (STD, STD, STD))).steps
+    with pytest.raises(ValueError, match="a pair has no factor"):
+        normal_equations(np.zeros((4, 3)), (steps, np.ones(3))).pair_covariances(np.array([[1, 3]]))
+
+
+def test_an_order_that_means_too_much_work_is_not_found_to_its_end() -> None:
+    """A chain of 300 rows has 299 columns of one block: 299 blocks are multiplied."""
+    pairs = problem(300, 0, seed=0)[1].pairs
+    assert BlockStructure(pairs, 300, most_work=299).complete and not BlockStructure(pairs, 300, most_work=298).complete
 
 
 def equations(poses: Tensor, factors: list[Factors], structure: GraphStructure | None = None) -> NormalEquations:

@@ -12,6 +12,7 @@ from ngo_estimator.graph import robust
 from ngo_estimator.graph.corrector import GraphProblem, normal_equations, truncated_cost
 from ngo_estimator.graph.crowds import CrowdAware, without_crowds
 from ngo_estimator.graph.cycle_agreement import ChainUncertainty, chain_poses
+from ngo_estimator.graph.loop_errors import squared_and_log
 from ngo_estimator.graph.relative_poses import RelativePoses
 from ngo_estimator.graph.robust import Robust
 from ngo_estimator.graph.surest_first import believe
@@ -232,6 +233,20 @@ def test_covariances_of_pairs_are_those_of_a_dense_inverse() -> None:
     np.testing.assert_allclose(
         equations.pair_covariances(np.array([[0, 1]]))[0, 3:, 3:], equations.covariance([1]), rtol=1e-6, atol=1e-12
     )
+
+
+def test_what_a_graph_predicts_of_loops_is_as_sure_as_dense_matrices_say() -> None:
+    problem, _ = square(2, 9)
+    parts = [(edges, np.ones(len(edges))) for edges in (problem.steps, problem.loops)]
+    poses, loops = problem.poses, problem.loops[:10]
+    joint = normal_equations(poses, *parts).pair_covariances(loops.nodes)
+    jacobian, residuals = loops.whitened_jacobian(poses), loops.residuals(poses)
+    predicted = loops.predicted_covariances(poses, joint)
+    np.testing.assert_allclose(predicted, jacobian @ joint @ jacobian.mT, rtol=1e-9, atol=1e-12)
+    total = predicted + np.eye(3)
+    squared, logs = squared_and_log(residuals, predicted)
+    np.testing.assert_allclose(squared, np.einsum("ki,kij,kj->k", residuals, np.linalg.inv(total), residuals))
+    np.testing.assert_allclose(logs, np.linalg.slogdet(total)[1])
 
 
 def outvoted() -> tuple[GraphProblem, np.ndarray]:

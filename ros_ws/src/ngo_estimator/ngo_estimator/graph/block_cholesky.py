@@ -26,14 +26,18 @@ class BlockStructure:
     Args:
         pairs: rows that blocks beside the diagonal join ``(n, 2)``, each 0 to ``count - 1``, in any order and number.
         count: rows of blocks.
+        most_work: how many blocks a factorisation may multiply. Beyond it the order of elimination is not found to its
+            end, and the structure is of no use.
     """
 
-    def __init__(self, pairs: Array, count: int) -> None:
+    def __init__(self, pairs: Array, count: int, most_work: float = math.inf) -> None:
         self.pairs = np.ascontiguousarray(pairs, np.int64).reshape(-1, 2)
         if len(self.pairs) and not 0 <= self.pairs.min() <= self.pairs.max() < count:
             raise ValueError(f"pairs join rows {self.pairs.min()} to {self.pairs.max()}; expected 0 to {count - 1}")
         self.count = count
-        self.rank, self.starts, self.rows = _eliminated(self.pairs, count)
+        self.rank, self.starts, self.rows = _eliminated(self.pairs, count, float(most_work))
+        self.complete = len(self.starts) == count + 1
+        """Whether the order of elimination was found to its end."""
         """Place of each row in the order ``(count,)``; where the blocks of each column begin ``(count + 1,)``; the
         places of their rows ``(blocks,)``, ascending in a column."""
 
@@ -41,17 +45,6 @@ class BlockStructure:
     def blocks(self) -> int:
         """Blocks below the diagonal."""
         return len(self.rows)
-
-    def places(self, pairs: Array) -> tuple[Array, Array]:
-        """Index of the block of each pair ``(n,)`` of different rows, and whether its row is the pair's first.
-
-        Raises:
-            ValueError: there is no such block.
-        """
-        ranks, place = placed(pairs, self.rank, self.starts, self.rows)
-        if (place < 0).any():
-            raise ValueError("a pair has no block; expected pairs of the structure")
-        return place, ranks[:, 0] > ranks[:, 1]
 
 
 class BlockCholesky:
@@ -112,10 +105,10 @@ def _lowest(word: Any) -> Any:
 
 
 @njit(cache=True)
-def _eliminated(pairs: Array, count: int) -> tuple[Array, Array, Array]:
+def _eliminated(pairs: Array, count: int, most_work: float) -> tuple[Array, Array, Array]:
     """Rank of each row, starts of the factor's columns, and the ranks of their rows.
 
-    The first row of least degree is eliminated next.
+    The first row of least degree is eliminated next. There are fewer starts where there is too much work.
     """
     words = (count + 63) // 64
     neighbours = np.zeros((count, words), np.uint64)
@@ -134,6 +127,7 @@ def _eliminated(pairs: Array, count: int) -> tuple[Array, Array, Array]:
     rows = np.empty(max(16, 8 * count), np.int64)
     filled = 0
     least = 0
+    work = 0.0
     for step in range(count):
         pivot = -1
         while pivot < 0:
@@ -160,6 +154,9 @@ def _eliminated(pairs: Array, count: int) -> tuple[Array, Array, Array]:
                 filled += 1
                 word ^= lowest
         starts[step + 1] = filled
+        work += float(filled - first) ** 2
+        if work > most_work:
+            return rank, starts[:step], rows[:0]
         for k in range(first, filled):
             a = rows[k]
             here = _ONE << np.uint64(a % 64)

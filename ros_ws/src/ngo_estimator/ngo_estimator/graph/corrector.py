@@ -4,6 +4,7 @@ Every sensor states its graph as a ``GraphProblem``; what solves it is a ``Corre
 cost, ``truncated_cost``, so that the better of two solutions can be kept whoever made it.
 """
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Protocol
@@ -52,6 +53,15 @@ class GraphProblem:
     def scaled(self, variance: float) -> "GraphProblem":
         """The same with all covariances so many times as large."""
         return replace(self, steps=self.steps.scaled(variance), loops=self.loops.scaled(variance))
+
+    def fits(self, poses: np.ndarray) -> np.ndarray:
+        """Whether poses ``(nodes, 3)`` are within the threshold of each loop ``(loops,)``."""
+        within: np.ndarray = self.loops.squared(poses) <= thresholds(self.loops)
+        return within
+
+    def structure(self, most_work: float = math.inf) -> GraphStructure:
+        """That of all steps and loops, in this order; ``most_work`` is that of ``BlockStructure``."""
+        return GraphStructure(np.concatenate((self.steps.nodes, self.loops.nodes)), len(self.poses), most_work)
 
 
 @dataclass(frozen=True)
@@ -112,7 +122,7 @@ def truncated_cost(problem: GraphProblem, poses: np.ndarray, step_scale: float =
 
     What a loop costs is multiplied by its trust, and variances by their scales.
     """
-    steps, loops = ((x.residuals(poses) ** 2).sum(1) for x in (problem.steps, problem.loops))
+    steps, loops = (x.squared(poses) for x in (problem.steps, problem.loops))
     refused = np.minimum(loops / loop_scale, thresholds(problem.loops))
     return float(np.minimum(steps / step_scale, STEP_LIMIT).sum() + (problem.trust * refused).sum())
 

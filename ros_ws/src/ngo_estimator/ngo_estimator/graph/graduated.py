@@ -13,7 +13,10 @@ _GROWTH = 1.4
 """Of the control from stage to stage."""
 
 _NEAR_GROWTH = 2.0
-"""The same where poses are nearly right."""
+"""The same where poses are nearly right, or follow no more."""
+
+_AT_REST = 1e-2
+"""Size of a step (m, rad) below which poses follow no more."""
 
 _MOST_STAGES = 100
 _LEAST_STEP = 1e-3
@@ -32,37 +35,39 @@ def graduate(
     control: float | None = None,
     steps_break: bool = False,
     told: Told = silent,
+    structure: GraphStructure | None = None,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Poses ``(nodes, 3)``, and weights of loops ``(loops,)`` and of steps ``(nodes - 1,)``, from poses on.
 
     ``control`` is where to begin: without it so that every residual is on the convex side; 1 and above is close to the
-    truncated cost, as for poses that are nearly right.
+    truncated cost, as for poses that are nearly right. ``structure`` is that of all steps and loops, where it is known.
     """
     poses, limits = poses.copy(), thresholds(problem.loops)
-    squared = (problem.loops.residuals(poses) ** 2).sum(1) / limits
-    growth = _NEAR_GROWTH if control else _GROWTH
+    squared = problem.loops.squared(poses) / limits
+    near = control is not None
     if control is None:
         control = 1.0 / max(2.0 * float(squared.max(initial=0.0)) - 1.0, 1e-3)
     step_weights = np.ones(len(problem.steps))
-    rows, loops, structure = np.zeros(0, np.int64), problem.loops[:0], None
+    rows, known, loops = np.arange(len(limits)), np.ones(len(limits), bool), problem.loops
     for stage in range(_MOST_STAGES):
         weights = problem.trust * _weights(squared, control)
-        believed = np.flatnonzero(weights > 0.0)
-        if structure is None or len(believed) < _SPARSER * len(rows) or not np.isin(believed, rows).all():
-            rows, loops = believed, problem.loops[believed]
+        believed = weights > 0.0
+        if structure is None or believed.sum() < _SPARSER * len(rows) or (believed & ~known).any():
+            rows, known = np.flatnonzero(believed), believed
+            loops = problem.loops[rows]
             structure = GraphStructure(np.concatenate((problem.steps.nodes, loops.nodes)), len(poses))
         parts = (problem.steps, step_weights), (loops, weights[rows])
         step = normal_equations(poses, *parts, structure=structure).solution()
         poses = poses + step
-        squared = (problem.loops.residuals(poses) ** 2).sum(1) / limits
+        squared = problem.loops.squared(poses) / limits
         if steps_break:
-            off = (problem.steps.residuals(poses) ** 2).sum(1) / STEP_LIMIT
+            off = problem.steps.squared(poses) / STEP_LIMIT
             step_weights = np.maximum(_weights(off, control), _LEAST_WEIGHT)
         told(f"graduated non-convexity, stage {stage + 1}: {(squared <= 1.0).sum()} of {len(squared)} loops fit")
-        decided = _weights(squared, control)
-        if np.abs(step).max() < _LEAST_STEP and ((decided < 0.01) | (decided > 0.99)).all():
+        decided, moved = _weights(squared, control), np.abs(step).max()
+        if moved < _LEAST_STEP and ((decided < 0.01) | (decided > 0.99)).all():
             break
-        control *= growth
+        control *= _NEAR_GROWTH if near or moved < _AT_REST else _GROWTH
     poses[:, 2] = np.arctan2(np.sin(poses[:, 2]), np.cos(poses[:, 2]))
     return poses, problem.trust * (squared <= 1.0), step_weights
 

@@ -10,6 +10,7 @@ from scipy.spatial import KDTree
 
 from ngo_estimator.graph.corrector import GraphProblem
 from ngo_estimator.graph.cycle_agreement import ChainUncertainty
+from ngo_estimator.graph.loop_errors import squared_and_log
 from ngo_estimator.graph.normal_equations import NormalEquations
 from ngo_estimator.graph.place_agreement import place_ratio
 from ngo_estimator.graph.relative_poses import RelativePoses
@@ -107,10 +108,8 @@ def predicted_odds(
     are whitened by the covariance of the graph and of the loop together.
     """
     loops = problem.loops
-    jacobian = loops.whitened_jacobian(poses)
-    total = jacobian @ equations.pair_covariances(loops.nodes) @ jacobian.mT + np.eye(3)
-    residuals = loops.residuals(poses)
-    squared = (residuals * np.linalg.solve(total, residuals[..., None])[..., 0]).sum(1)
+    predicted = loops.predicted_covariances(poses, equations.pair_covariances(loops.nodes))
+    squared, logs = squared_and_log(loops.residuals(poses), predicted)
     known = np.einsum("kii->ki", loops.root)
-    logs = np.linalg.slogdet(total)[1] - 2.0 * np.log(np.where(known != 0.0, np.abs(known), 1.0)).sum(1)
+    logs = logs - 2.0 * np.log(np.where(known != 0.0, np.abs(known), 1.0)).sum(1)
     return likelihood_ratio(squared, logs, loops.degrees, area), squared

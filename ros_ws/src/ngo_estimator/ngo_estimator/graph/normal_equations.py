@@ -19,13 +19,16 @@ class GraphStructure:
 
     Args:
         nodes: of all factors ``(factors, 2)``, each 0 to ``count - 1``; the pose of node 0 is known.
+        most_work: see ``BlockStructure``.
     """
 
-    def __init__(self, nodes: Array, count: int) -> None:
+    def __init__(self, nodes: Array, count: int, most_work: float = math.inf) -> None:
         self.nodes, self.count = nodes, count
         rows, pairs = _joined(nodes)
-        self.blocks = BlockStructure(pairs, count - 1)
+        self.blocks = BlockStructure(pairs, count - 1, most_work)
         """Those of the information matrix, whose row ``k`` is node ``k + 1``."""
+        if not self.blocks.complete:
+            return
         self.ranks, self.place = placed(rows, self.blocks.rank, self.blocks.starts, self.blocks.rows)
         """Places of the factors' nodes in the order of elimination ``(factors, 2)``; -1 for node 0. Index of the block
         that joins a factor's nodes ``(factors,)``; -1 where one of them is node 0."""
@@ -91,18 +94,11 @@ class NormalEquations:
         Raises:
             ValueError: no factor joins a pair.
         """
-        diagonal, lower = self._factor.selected_inverse()
-        rows = np.asarray(pairs) - 1
-        joint = np.zeros((len(rows), 2, 3, 2, 3))
-        for side in (0, 1):
-            known = rows[:, side] >= 0
-            joint[known, side, :, side] = diagonal[self._structure.rank[rows[known, side]]]
-        both = (rows >= 0).all(1)
-        place, first_below = self._structure.places(rows[both])
-        block = lower[place]
-        block[~first_below] = block[~first_below].mT
-        joint[both, 0, :, 1], joint[both, 1, :, 0] = block, block.mT
-        return joint.reshape(-1, 6, 6)
+        blocks, rows = self._structure, np.ascontiguousarray(pairs, np.int64) - 1
+        ranks, place = placed(rows, blocks.rank, blocks.starts, blocks.rows)
+        if ((place < 0) & (rows >= 0).all(1)).any():
+            raise ValueError("a pair has no factor; expected pairs that a factor joins")
+        return _joint(ranks, place, *self._factor.selected_inverse())
 
 
 def diagonal_information(values: Array) -> Array:
@@ -110,6 +106,21 @@ def diagonal_information(values: Array) -> Array:
     information = np.zeros((*values.shape, 3))
     np.einsum("kii->ki", information)[:] = values
     return information
+
+
+@njit(cache=True)
+def _joint(ranks: Array, place: Array, diagonal: Array, lower: Array) -> Array:
+    """Joint covariances ``(n, 6, 6)`` of pairs of rows, from the blocks of an inverse matrix; see ``placed``."""
+    joint = np.zeros((len(ranks), 6, 6))
+    for k in range(len(ranks)):
+        for side in range(2):
+            if ranks[k, side] >= 0:
+                joint[k, 3 * side : 3 * side + 3, 3 * side : 3 * side + 3] = diagonal[ranks[k, side]]
+        if place[k] >= 0:
+            block = lower[place[k]] if ranks[k, 0] > ranks[k, 1] else lower[place[k]].T
+            joint[k, :3, 3:] = block
+            joint[k, 3:, :3] = block.T
+    return joint
 
 
 @njit(cache=True)

@@ -5,7 +5,7 @@ from functools import cached_property
 
 import numpy as np
 
-from ngo_estimator.geometry.se2 import between, wrap
+from ngo_estimator.graph.loop_errors import predicted_covariances, whitened_residuals
 
 BELIEVED = 0.5
 """Weight of an edge, zero to one, from which on it is believed."""
@@ -74,10 +74,28 @@ class RelativePoses:
 
     def residuals(self, poses: np.ndarray) -> np.ndarray:
         """Whitened residuals ``(n, 3)``, measured less predicted, under poses ``(nodes, 3)``."""
-        off = self.relative - between(poses[self.nodes[:, 0]], poses[self.nodes[:, 1]])
-        off[:, 2] = wrap(off[:, 2])
-        whitened: np.ndarray = (self.root @ off[..., None])[..., 0]
+        whitened: np.ndarray = whitened_residuals(*self._arrays, np.ascontiguousarray(poses, np.float64))
         return whitened
+
+    def squared(self, poses: np.ndarray) -> np.ndarray:
+        """Squared lengths ``(n,)`` of the whitened residuals."""
+        residuals = self.residuals(poses)
+        squared: np.ndarray = np.einsum("ki,ki->k", residuals, residuals)
+        return squared
+
+    def predicted_covariances(self, poses: np.ndarray, joint: np.ndarray) -> np.ndarray:
+        """Covariances ``(n, 3, 3)`` of the whitened predictions, from those ``(n, 6, 6)`` of both nodes' poses."""
+        predicted: np.ndarray = predicted_covariances(self._arrays[0], self._arrays[2], poses, joint)
+        return predicted
+
+    @cached_property
+    def _arrays(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Nodes, relative poses and roots as compiled code takes them."""
+        return (
+            np.ascontiguousarray(self.nodes, np.int64),
+            np.ascontiguousarray(self.relative, np.float64),
+            np.ascontiguousarray(self.root, np.float64),
+        )
 
     def whitened_jacobian(self, poses: np.ndarray) -> np.ndarray:
         """Derivative ``(n, 3, 6)`` of the whitened prediction by the poses of both nodes."""

@@ -44,6 +44,9 @@ _MOST_FILLED = 2_000_000
 _FEWER = 0.7
 """How many loops are tried where those before are too many."""
 
+_RULED_OUT = 0.2
+"""Where cycles of places rule out so many of the loops that fit in the end, the chain is worse than stated."""
+
 _LEAST_REDUNDANCY = 30.0
 """Degrees of freedom from which on residuals measure a scale."""
 
@@ -100,15 +103,20 @@ def _from_nothing(problem: GraphProblem, told: Told, least_scale: float) -> Corr
         scaled = problem.scaled(scale)
     odds = cycle_odds(ChainUncertainty(scaled.steps), scaled.loops, area, inlier_ratio)
     begun, rows = replace(scaled, poses=chain), np.argsort(-odds, kind="stable")
-    likely = _affordable(begun, rows[: np.count_nonzero(odds > 0.0)])
+    likely, structure = _affordable(begun, rows[: np.count_nonzero(odds > 0.0)])
+    nothing = np.zeros(len(likely.loops), bool)
     solutions = [
-        graduate(likely, chain, told=told)[0],
-        believe(likely, chain, np.zeros(len(likely.loops), bool), area, inlier_ratio, told)[0],
+        graduate(likely, chain, told=told, structure=structure)[0],
+        believe(likely, chain, nothing, area, inlier_ratio, told, structure)[0],
     ]
-    solutions += [_looked_again(scaled, poses, area, inlier_ratio, told) for poses in solutions]
-    if not metric.all():  # of a chain that is worse than stated, cycles of places rule out right ones
-        solutions.append(graduate(_affordable(begun, rows), chain, told=told)[0])
+    different = {scaled.fits(poses).tobytes(): poses for poses in solutions}  # what believes the same ends at the same
+    solutions += [_looked_again(scaled, poses, area, inlier_ratio, told) for poses in different.values()]
     best = min(solutions, key=lambda poses: truncated_cost(scaled, poses))
+    believed = scaled.fits(best) & ~metric
+    if not metric.all() and (odds[believed] <= 0.0).sum() >= _RULED_OUT * believed.sum():
+        everything, structure = _affordable(begun, rows)
+        poses = graduate(everything, chain, told=told, structure=structure)[0]
+        best = min(best, poses, key=lambda poses: truncated_cost(scaled, poses))
     solution = _polished(problem, best, scale, len(problem.loops), least_scale)
     # Cycles with the chain have its errors in common and measure a scale roughly; residuals of the solution do it well.
     if scale not in (1.0, solution.loop_scale):
@@ -118,10 +126,9 @@ def _from_nothing(problem: GraphProblem, told: Told, least_scale: float) -> Corr
 
 def _looked_again(problem: GraphProblem, poses: np.ndarray, area: float, inlier_ratio: float, told: Told) -> np.ndarray:
     """Poses after what they predict has let more loops in: a cycle with a long chain ruled some out that are right."""
-    misfit = (problem.loops.residuals(poses) ** 2).sum(1) / thresholds(problem.loops)
-    nearest = _affordable(replace(problem, poses=poses), np.argsort(misfit, kind="stable"))
-    believed = (nearest.loops.residuals(poses) ** 2).sum(1) <= thresholds(nearest.loops)
-    return believe(nearest, poses, believed, area, inlier_ratio, told)[0]
+    misfit = problem.loops.squared(poses) / thresholds(problem.loops)
+    nearest, structure = _affordable(replace(problem, poses=poses), np.argsort(misfit, kind="stable"))
+    return believe(nearest, poses, nearest.fits(poses), area, inlier_ratio, told, structure)[0]
 
 
 def _warm(problem: GraphProblem, start: CorrectedGraph, told: Told, least_scale: float) -> CorrectedGraph:
@@ -132,20 +139,19 @@ def _warm(problem: GraphProblem, start: CorrectedGraph, told: Told, least_scale:
     scaled, believed = problem.scaled(start.scale), np.zeros(len(problem.loops), bool)
     believed[:old] = start.loop_weights > 0.0
     # A loop that was refused is asked again where it fits, or when all are.
-    fits = (scaled.loops.residuals(poses) ** 2).sum(1) <= thresholds(scaled.loops)
-    asked = np.flatnonzero(believed | fits | (np.arange(len(believed)) >= old))
+    asked = np.flatnonzero(believed | scaled.fits(poses) | (np.arange(len(believed)) >= old))
     part = replace(scaled, loops=scaled.loops[asked], trust=scaled.trust[asked])
     poses, _ = believe(part, poses, believed[asked], map_area(poses), told=told)
     return _polished(problem, poses, start.scale, start.loops_from_nothing, least_scale)
 
 
-def _affordable(problem: GraphProblem, rows: np.ndarray) -> GraphProblem:
-    """The problem with the first of these loops alone, as many as do not fill its factor."""
+def _affordable(problem: GraphProblem, rows: np.ndarray) -> tuple[GraphProblem, GraphStructure]:
+    """The problem with the first of these loops alone, as many as do not fill its factor, and its structure."""
     while True:
         part = replace(problem, loops=problem.loops[rows], trust=problem.trust[rows])
-        structure = GraphStructure(np.concatenate((part.steps.nodes, part.loops.nodes)), len(part.poses))
-        if np.square(np.diff(structure.blocks.starts)).sum() <= _MOST_FILLED:
-            return part
+        structure = part.structure(_MOST_FILLED)
+        if structure.blocks.complete:
+            return part, structure
         rows = rows[: int(_FEWER * len(rows))]
 
 
@@ -176,11 +182,11 @@ def _found_scales(problem: GraphProblem, solution: CorrectedGraph) -> tuple[floa
     equations = normal_equations(solution.poses, *parts)
 
     def found(edges: RelativePoses, weights: np.ndarray) -> float:
-        jacobian = edges.whitened_jacobian(solution.poses)
-        known = np.einsum("kij,kjl,kil->k", jacobian, equations.pair_covariances(edges.nodes), jacobian)
+        predicted = edges.predicted_covariances(solution.poses, equations.pair_covariances(edges.nodes))
+        known = np.einsum("kii->k", predicted)
         redundancy = float((weights * (edges.degrees - weights * known)).sum())
         if redundancy < _LEAST_REDUNDANCY:
             return 1.0
-        return float((weights * (edges.residuals(solution.poses) ** 2).sum(1)).sum()) / redundancy
+        return float((weights * edges.squared(solution.poses)).sum()) / redundancy
 
     return found(*parts[0]), found(*parts[1])

@@ -13,11 +13,14 @@ from ngo_estimator.graph.loop_evidence import predicted_odds
 from ngo_estimator.graph.normal_equations import GraphStructure
 
 _MOST_ROUNDS = 40
-_SHARE = 0.25
+_SHARE = 0.5
 """How many of the loops that may be believed are, in one round."""
 
 _AT_LEAST = 20
 """The same in loops."""
+
+_ADDED = 0.05
+"""The same as a share of those that are believed: so many more bend a graph little that so many others hold."""
 
 _LEAST_ODDS = math.log(10.0)
 """Of a loop that is believed."""
@@ -39,27 +42,29 @@ def believe(
     area: float,
     inlier_ratio: float = 0.5,
     told: Told = silent,
+    structure: GraphStructure | None = None,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Poses ``(nodes, 3)`` and which loops are believed ``(loops,)``, beginning with those that are.
 
     Args:
         area: see ``map_area``.
         inlier_ratio: of the loops, before anything is known of them.
+        structure: that of all steps and loops, where it is known.
     """
     poses, believed, limits = poses.copy(), believed.copy(), thresholds(problem.loops)
     prior = math.log(inlier_ratio / (1.0 - inlier_ratio)) + np.log(np.maximum(problem.trust, 1e-9))
-    rows, structure = np.arange(len(problem.loops)), None
+    rows, likely = np.arange(len(problem.loops)), problem
     alive = np.ones(len(rows), bool)
     for round_ in range(_MOST_ROUNDS):
         if structure is None or alive.sum() < _SPARSER * len(rows):
             rows = np.flatnonzero(alive)
             likely = GraphProblem(poses, problem.steps, problem.loops[rows], problem.trust[rows])
-            structure = GraphStructure(np.concatenate((likely.steps.nodes, likely.loops.nodes)), len(poses))
+            structure = likely.structure()
         parts = (problem.steps, np.ones(len(problem.steps))), (likely.loops, believed[rows].astype(np.float64))
         equations = normal_equations(poses, *parts, structure=structure)
         step = equations.solution()
         poses = poses + step
-        squared = (likely.loops.residuals(poses) ** 2).sum(1)
+        squared = likely.loops.squared(poses)
         left = believed[rows] & (squared > limits[rows])
         ratio, off = predicted_odds(likely, poses, equations, area)
         odds = np.where(~believed[rows] & (off <= limits[rows]), ratio + prior[rows], -np.inf)
@@ -67,7 +72,7 @@ def believe(
         if len(new) == 0 and not left.any() and np.abs(step).max() < _AT_REST:
             break
         told(f"the surest loops first, round {round_ + 1}: {believed.sum()} of {len(believed)} loops are believed")
-        most = max(_AT_LEAST, int(_SHARE * len(new)))
+        most = max(_AT_LEAST, int(_SHARE * len(new)), int(_ADDED * believed.sum()))
         believed[rows[left]] = False
         believed[rows[new[np.argsort(-odds[new], kind="stable")[:most]]]] = True
         alive[rows] = believed[rows] | (off <= _SURELY_WRONG * limits[rows])

@@ -61,7 +61,7 @@ class ChainedGraph:
     def misfit(self, solution: CorrectedGraph) -> np.ndarray:
         """Squared residual of each loop ``(loops,)``, in those that a right one stays below."""
         loops = self.problem.loops
-        misfit: np.ndarray = (loops.residuals(solution.poses) ** 2).sum(1) / thresholds(loops)
+        misfit: np.ndarray = loops.squared(solution.poses) / thresholds(loops)
         return misfit
 
 
