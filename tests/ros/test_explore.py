@@ -17,6 +17,7 @@ from nav_msgs.msg import MapMetaData, OccupancyGrid
 from ngo_msgs.action import Explore
 from rclpy.action import ActionClient, ActionServer, CancelResponse, GoalResponse
 from rclpy.qos import DurabilityPolicy, QoSProfile
+from rclpy.task import Future
 from sensor_msgs.msg import LaserScan
 from std_msgs.msg import Bool
 from tf2_msgs.msg import TFMessage
@@ -47,13 +48,15 @@ _MAP_S, _TF_S = 0.15, 0.02
 class World:
     """A robot in TRUTH: takes velocities, publishes map, changes of the map and transforms.
 
-    ``map_from_odom`` may jump. ``shift`` cells are cut off the map's left side, so that its origin is another.
+    ``off`` is where odom lies in the map: a loop that closes moves it. ``shift`` cells are cut off the map's left
+    side, so that its origin is another.
     """
 
     def __init__(self, probe: Probe) -> None:
         self.probe, self.pose, self.known = probe, START.copy(), np.full_like(TRUTH, -1)
         self.twist, self.heard, self.moved_m, self.shift, self.silent = (0.0, 0.0), 0, 0.0, 0, False
         self.clients: list[ActionClient] = []
+        self.off = np.zeros(2)
         node = probe.node
         self._map = node.create_publisher(OccupancyGrid, "map", LATCHED)
         self._updates = node.create_publisher(OccupancyGridUpdate, "map_updates", 10)
@@ -79,9 +82,8 @@ class World:
             row, column = (self.pose[1::-1] / RESOLUTION_M).astype(int)
             assert TRUTH[row, column] == 0, "the robot drove into a wall"
             if not self.silent:
-                self._tf.publish(
-                    TFMessage(transforms=[placed("map", "odom", np.zeros(3)), placed("odom", "base_link", self.pose)])
-                )
+                odom = placed("map", "odom", np.array((*self.off, 0.0)))
+                self._tf.publish(TFMessage(transforms=[odom, placed("odom", "base_link", self.pose)]))
             if self.scan_m is not None:
                 rays = {"angle_min": -3.0, "angle_max": 3.0, "angle_increment": 0.1, "range_max": 9.0}
                 scan = LaserScan(ranges=[self.scan_m] * 61, **rays)
@@ -97,7 +99,7 @@ class World:
         """Publish the part of the map that is not cut off."""
         values = self.known[:, self.shift :]
         info = MapMetaData(resolution=RESOLUTION_M, width=values.shape[1], height=values.shape[0])
-        info.origin.position.x = self.shift * RESOLUTION_M
+        info.origin.position.x, info.origin.position.y = (self.off + (self.shift * RESOLUTION_M, 0.0)).tolist()
         info.origin.orientation.w = 1.0
         message = OccupancyGrid(info=info, data=values.ravel().tolist())
         message.header.frame_id = "map"
@@ -152,16 +154,20 @@ def test_it_explores_a_building_to_its_end_and_comes_home_while_the_map_grows(wo
     feedback: list[Any] = []
     with NodeProcess("ngo_explorer", "explore", {**FAST, "drive": "own"}) as node:
         client = ready(world, node)
-        handle = start(world, client, Explore.Goal(return_to_start=True), feedback)
+        assert not start(world, client, Explore.Goal(mode="careful")).accepted and "'careful'" in node.log
+        handle = start(world, client, Explore.Goal(return_to_start=True, mode=Explore.Goal.ACCURATE), feedback)
         assert handle.accepted
         world.until(lambda: world.moved_m > 0.3, "a motion")
         world.shift = 5  # origin and size of the map change
+        world.off = np.array((0.34, -0.22))  # a loop closes: frame and map jump
         refused = start(world, client, Explore.Goal())
         assert not refused.accepted, "one at a time"
+        world.until(lambda: world.moved_m > 1.5, "some way")
+        world.pose[:] = START  # somebody carries it back
         answer = finish(world, handle)
         assert (answer.status, answer.result.ended) == (GoalStatus.STATUS_SUCCEEDED, "complete"), node.log
         assert (world.known[:, 10:][TRUTH[:, 10:] == 0] == 0).mean() > 0.98
-        assert np.hypot(*(world.pose - START)[:2]) < 0.5, "it came home"
+        assert np.hypot(*(world.pose - START)[:2] + world.off) < 0.5, "it came home, where that was on the map"
         assert 10.0 < answer.result.area < 33.0 and answer.result.path_length > 2.0
         assert feedback and feedback[-1].feedback.deviation == -1.0
         assert any(message.feedback.goal.header.frame_id == "map" for message in feedback)
@@ -221,10 +227,10 @@ def test_cancel_time_limit_boundary_pause_and_a_robot_that_is_lost(world: World)
 
 
 class Nav2:
-    """A stand-in for Nav2's server: accepts or refuses goals; those accepted are reached, or aborted."""
+    """A stand-in for Nav2's server: accepts or refuses goals; those accepted are reached, aborted, or hang for ever."""
 
     def __init__(self, world: World) -> None:
-        self.world, self.goals, self.refuse, self.abort = world, [], 0, 0
+        self.world, self.goals, self.refuse, self.abort, self.hang = world, [], 0, 0, 0
         self.server = ActionServer(
             world.probe.node,
             NavigateToPose,
@@ -239,7 +245,10 @@ class Nav2:
         self.refuse -= 1
         return GoalResponse.REJECT if self.refuse >= 0 else GoalResponse.ACCEPT
 
-    def _execute(self, handle: Any) -> NavigateToPose.Result:
+    async def _execute(self, handle: Any) -> NavigateToPose.Result:
+        self.hang -= 1
+        if self.hang >= 0:
+            await Future()
         self.abort -= 1
         if self.abort >= 0:
             handle.abort()
@@ -251,14 +260,14 @@ class Nav2:
         return NavigateToPose.Result()
 
 
-def test_nav2_drives_and_its_refusals_aborts_and_death_end_nothing(world: World) -> None:
+def test_nav2_drives_and_its_refusals_aborts_silence_and_death_end_nothing(world: World) -> None:
     nav2 = Nav2(world)
-    parameters = {**FAST, "drive": "nav2", "nav2_timeout_s": 1.0, "progress_s": 5.0}
+    parameters = {**FAST, "drive": "nav2", "nav2_timeout_s": 1.0, "progress_s": 1.5}
     with NodeProcess("ngo_explorer", "explore", parameters) as node:
         client = ready(world, node)
-        nav2.refuse, nav2.abort = 1, 1
+        nav2.refuse, nav2.abort, nav2.hang = 1, 1, 1
         handle = start(world, client, Explore.Goal())
-        world.until(lambda: len(nav2.goals) >= 3, "goals after a refusal and an abort")
+        world.until(lambda: len(nav2.goals) >= 4, "goals after a refusal, an abort and silence")
         answer = finish(world, handle)
         assert answer.result.ended == "complete"
         assert (world.known[TRUTH == 0] == 0).mean() > 0.95
