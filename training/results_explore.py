@@ -54,7 +54,7 @@ from training.scoring.table import (
     samples,
 )
 
-ROWS = (*(rule for rule in RULES if rule != "tour"), "known_tour", "ours", "ours_accurate")
+ROWS = (*(rule for rule in RULES if rule != "tour"), "known_tour", "ours")
 BASE = "explore_lite"
 _EXPLORER = tuple(
     import_module(f"ngo_explorer.{found.name}") for found in iter_modules(ngo_explorer.__path__) if not found.ispkg
@@ -78,8 +78,8 @@ class Arguments(Folders):
     plans: Path | None = None
     """Folder of floor plans, for the kind plans."""
     rows: tuple[str, ...] = ROWS
-    """Rules to measure; explore_lite is always measured. ours_accurate needs poses of its own."""
-    own_rows: tuple[str, ...] = ("nearest", BASE, "ours", "ours_accurate")
+    """Rules to measure; explore_lite is always measured."""
+    own_rows: tuple[str, ...] = ("nearest", BASE, "ours")
     """Those of them to measure at poses of its own: each takes longer. Nobody drives the known tour without poses."""
     count: int = 10
     """Mazes."""
@@ -153,7 +153,7 @@ def _command(arguments: Arguments) -> str:
 
 
 def _table(kind: Kind, names: Sequence[str], arguments: Arguments) -> Table:
-    allowed = (*arguments.own_rows, BASE) if kind in WHEELS else [row for row in ROWS if row != "ours_accurate"]
+    allowed = (*arguments.own_rows, BASE) if kind in WHEELS else ROWS
     chosen = [name for name in names if name in allowed]
     rows = {name: _row(name, kind, arguments) for name in chosen}
     plan = [(drive, rows) for drive in _drives(kind, arguments)]
@@ -202,8 +202,7 @@ def _measure(
     if name == "known_tour":
         run = drive_known_tour(world, place.seen, config, DriveConfig(), most_s)
     else:
-        accurate = name == "ours_accurate"
-        run = explore(world, place.seen, config, DriveConfig(), most_s=most_s, estimator=estimator, accurate=accurate)
+        run = explore(world, place.seen, config, DriveConfig(), most_s=most_s, estimator=estimator)
     return Measured.of(
         scores(run, place.seen),
         path_m=run.path_m,

@@ -67,7 +67,7 @@ LAYERS = {
     "ngo_explorer": [
         {"settings", "known_map", "tours"},
         {"frontiers", "planner", "boundary"},
-        {"put_aside", "revisits", "rules", "path_follower"},
+        {"put_aside", "rules", "path_follower"},
         {"exploration"},
         {"pilot"},
         {"warm_up"},

@@ -28,7 +28,6 @@ _ROWS = {
     "d_optimality": "D-optimality of the graph",
     "known_tour": "tour on the known map",
     "ours": "**tour over frontiers**",
-    "ours_accurate": "tour over frontiers, accurate",
 }
 _INTRODUCTION = """# Results: exploration
 

@@ -59,11 +59,6 @@ class Estimator(Protocol):
     pose_xyyaw: np.ndarray
     stamp_ns: int
 
-    @property
-    def deviation_m(self) -> float:
-        """Standard deviation of the position now."""
-        ...
-
     def take(self, sight: Sight) -> None:
         """Take what was measured."""
         ...
@@ -117,15 +112,14 @@ def explore(
     seed: int = 0,
     most_s: float = 3600.0,
     estimator: Callable[[np.ndarray], Estimator] | None = None,
-    accurate: bool = False,
 ) -> Explored:
     """Explore a world until the robot says that nothing is left, or for most_s of simulated time.
 
     estimator: begins one at the first pose; None: the robot knows its true poses. What it has seen is counted at true
-    poses always. accurate: whether the robot goes back before its position gets too uncertain.
+    poses always.
     """
     run = _Run(world, seen, estimator)
-    exploration = Exploration(config, seed=seed, accurate=accurate)
+    exploration = Exploration(config, seed=seed)
     run.drive(exploration, PathFollower(drive, config), most_s)
     return run.explored()
 
@@ -189,8 +183,6 @@ class _Run:
             mapped, decided, begun_s = self.look(), pilot.decided, time.process_time()
             if mapped or exploration.known.empty:
                 exploration.known.update(self.found.values, RESOLUTION_M, self.found.origin_xy)
-            if self._estimator is not None:
-                exploration.deviation_m = self._estimator.deviation_m
             pilot.step(self.pose_xyyaw, self.sight.time_s)
             if pilot.decided > decided:
                 self._decisions_ms.append(1e3 * (time.process_time() - begun_s))

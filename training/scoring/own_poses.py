@@ -44,11 +44,6 @@ class OwnPoses:
             self._map.take(step, self._source.scans(step))
             self.pose_xyyaw, self.stamp_ns = compose(self._first, update.pose_xyyaw), step.stamp_ns
 
-    @property
-    def deviation_m(self) -> float:
-        """Standard deviation of the position now."""
-        return float(np.sqrt(max(0.0, np.linalg.eigvalsh(self._covariances[-1][:2, :2])[-1])))
-
     def cells(self) -> OccupancyMap:
         """The map so far, of all scans at the poses that are known now."""
         trajectory = self._online.trajectory()

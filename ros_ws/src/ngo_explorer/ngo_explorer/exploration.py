@@ -14,7 +14,6 @@ from ngo_explorer.frontiers import Candidate, Frontier, FrontierFinder, viewpoin
 from ngo_explorer.known_map import Floats, KnownMap
 from ngo_explorer.planner import cost_field, plan_path
 from ngo_explorer.put_aside import PutAside
-from ngo_explorer.revisits import Revisits
 from ngo_explorer.rules import Situation, make_rule
 from ngo_explorer.settings import ExplorerConfig
 
@@ -30,7 +29,7 @@ _EXPLORE_LITE = (0.75, 30.0, 1.0 / 0.15)  # its smallest frontier, time without 
 class Goal:
     """Where to drive: ``pose_xyyaw`` ``(3,)``, along ``path`` ``(n, 2)``.
 
-    candidate: what is to be seen; None: nothing new, as at home and where the robot goes back to.
+    candidate: what is to be seen; None: nothing new, as at home.
     """
 
     pose_xyyaw: Floats
@@ -50,17 +49,11 @@ class Exploration:
     """Chooses goals while the map grows.
 
     Its owner gives it maps (``known``), asks ``decide`` where to drive, and says how that went: ``arrived`` or
-    ``failed``. ``candidates`` and ``unreachable`` are the frontiers of the last decision that count. ``deviation_m`` is
-    the standard deviation of the robot's position now, as far as its owner knows it, or -1.
+    ``failed``. ``candidates`` and ``unreachable`` are the frontiers of the last decision that count.
     """
 
-    def __init__(
-        self, config: ExplorerConfig, boundary: Floats | None = None, seed: int = 0, accurate: bool = False
-    ) -> None:
-        """boundary: ``(n, 2)`` corners of a polygon in the map's frame, outside of which nothing is explored.
-
-        accurate: whether to go back to a place that is known better before ``deviation_m`` gets too large.
-        """
+    def __init__(self, config: ExplorerConfig, boundary: Floats | None = None, seed: int = 0) -> None:
+        """boundary: ``(n, 2)`` corners of a polygon in the map's frame, outside of which nothing is explored."""
         self._lite = config.rule == "explore_lite"
         if self._lite:
             least, progress, again = _EXPLORE_LITE
@@ -75,9 +68,6 @@ class Exploration:
         self._rule = make_rule(config, np.random.default_rng(seed))
         self._aside = PutAside()
         self._may_forget = True
-        self.deviation_m = -1.0
-        self._revisits = Revisits(config.accurate_m) if accurate else None
-        self._went_back_for: list[Floats] = []
         self._trail: list[Floats] = []
         self._decided_s = -math.inf
         self._best_way_m, self._progress_s = math.inf, 0.0
@@ -115,8 +105,6 @@ class Exploration:
         """Choose where to drive now; None where no frontier is left that can be reached."""
         robot = robot_xyyaw[:2]
         self._remember(robot)
-        if self._revisits is not None and self.deviation_m >= 0.0:
-            self._revisits.note(robot, self.deviation_m)
         if self.goal is not None and self.goal.candidate is None:
             if self.go_to(robot_xyyaw, self.goal.pose_xyyaw, now_s) is not None:
                 return self.goal
@@ -135,9 +123,7 @@ class Exploration:
             if path is not None:
                 if chosen != present:
                     self._best_way_m, self._progress_s = math.inf, now_s
-                goal = Goal(np.array((*candidate.viewpoint_xy, candidate.yaw)), path, candidate)
-                if self._revisit(robot_xyyaw, field, candidate, now_s) is None:
-                    self.goal = goal
+                self.goal = Goal(np.array((*candidate.viewpoint_xy, candidate.yaw)), path, candidate)
                 return self.goal
             self._drop(candidate, "no path is wide enough")
         self.goal = None
@@ -162,23 +148,6 @@ class Exploration:
         """Turn on the spot."""
         self._best_way_m, self._progress_s, self._decided_s = math.inf, now_s, now_s
         self.goal = Goal(pose_xyyaw, pose_xyyaw[None, :2], None)
-
-    def _revisit(
-        self, robot_xyyaw: Floats, field: NDArray[np.int32], candidate: Candidate, now_s: float
-    ) -> Goal | None:
-        """The place to go back to before a candidate, once for each; None: it may go on."""
-        seen = candidate.frontier.point_xy
-        if self._revisits is None or self.deviation_m < 0.0:
-            return None
-        if any(np.hypot(*(seen - before)) < _SAME_GOAL_M for before in self._went_back_for):
-            return None
-        place = self._revisits.place(
-            self.known, field, candidate.viewpoint_xy, candidate.way_m, self.deviation_m, self.need_m
-        )
-        if place is None:
-            return None
-        self._went_back_for.append(seen)
-        return self.go_to(robot_xyyaw, np.array((*place, robot_xyyaw[2])), now_s)
 
     def stands(self, robot_xy: Floats, now_s: float) -> bool:
         """Whether the robot has come no nearer to its goal for too long, along the path; turns do not count."""

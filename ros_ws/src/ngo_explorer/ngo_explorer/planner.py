@@ -31,14 +31,6 @@ def cost_field(known: KnownMap, start_xy: Floats, need_m: float, targets: Floats
     return np.asarray(_costs(known.roomy_m, need_m, known.comfort_m, start[0], start[1], goals))
 
 
-def cost_m(known: KnownMap, field: NDArray[np.int32], point_xy: Floats) -> float:
-    """What a field says of a point, in metres of easy path; infinite where no path leads there."""
-    row, column = (value // known.block for value in known.cell(point_xy))
-    inside = 0 <= row < field.shape[0] and 0 <= column < field.shape[1]
-    cost = int(field[row, column]) if inside else -1
-    return cost * known.block * known.resolution_m / 10.0 if cost >= 0 else math.inf
-
-
 def plan_path(
     known: KnownMap, field: NDArray[np.int32], start_xy: Floats, goal_xy: Floats, need_m: float
 ) -> Floats | None:

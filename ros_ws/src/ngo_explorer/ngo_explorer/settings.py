@@ -28,11 +28,6 @@ class ExplorerConfig(Settings):
     most_in_tour: int = setting(10, "Frontiers of which a tour is made, the nearest ones.", minimum=1, maximum=100)
     replan_s: float = setting(2.0, "Time between two decisions on the way, s.", minimum=0.1, maximum=600.0)
     switch: float = setting(0.15, "Share by which a new goal must be better than the present one.", minimum=0.0)
-    accurate_m: float = setting(
-        0.15,
-        "Deviation of the position at the next goal above which mode accurate first goes back to a known place, m.",
-        minimum=0.001,
-    )
     progress_s: float = setting(15.0, "Time without progress after which a goal is put aside, s.", minimum=1.0)
 
     def need_m(self, resolution_m: float) -> float:

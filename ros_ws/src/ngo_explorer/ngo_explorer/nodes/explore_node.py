@@ -132,8 +132,7 @@ class ExploreNode(Node):
         self._told_s = -math.inf
 
     def _renew(self) -> None:
-        accurate = self._request.mode == Explore.Goal.ACCURATE
-        self._exploration, self._pilot = Exploration(self._config, _boundary(self._request), accurate=accurate), None
+        self._exploration, self._pilot = Exploration(self._config, _boundary(self._request)), None
 
     def _end(self, why: str) -> None:
         self._halt()
@@ -195,7 +194,7 @@ class ExploreNode(Node):
             self._driver.check()
         elif isinstance(self._driver, PublishedGoals):
             self._driver.look(pose)
-        decided, exploration.deviation_m = self._pilot.decided, self._input.deviation_m
+        decided = self._pilot.decided
         self._pilot.step(pose, now_s)
         if self._pilot.decided > decided or time.monotonic() - self._told_s > _FEEDBACK_S:
             self._tell()
