@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+import zstandard
 from mcap.reader import make_reader
 from mcap.writer import CompressionType, Writer
 from rosbags.highlevel import AnyReader
@@ -222,7 +223,7 @@ def test_a_folder_whose_recorder_was_killed_needs_no_metadata(tmp_path: Path) ->
         ("empty.mcap", b"", "cannot be read as MCAP"),
         ("text.db3", b"not a recording, but longer than a head of sqlite" * 9, "cannot be read as a rosbag2 recording"),
         ("drive.bag", b"#ROSBAG V2.0", "cannot be read as a ROS 1 bag"),
-        ("drive.txt", b"#ROSBAG V2.0", "is no recording: expected a .mcap, .db3 or .bag file"),
+        ("drive.txt", b"12.5 1.0 2.0", "is no recording: expected a .mcap, .db3 or .bag file"),
     ],
 )
 def test_what_is_no_recording_is_refused_in_one_line(
@@ -237,17 +238,39 @@ def test_what_is_no_recording_is_refused_in_one_line(
 
 
 def test_a_folder_says_what_it_lacks(tmp_path: Path) -> None:
-    with pytest.raises(RecordingError, match=r"neither metadata.yaml nor .mcap or .db3 files"):
+    with pytest.raises(RecordingError, match=r"it has no .mcap or .db3 files"):
         open_recording([tmp_path])
     folder = m.write_mcap(tmp_path / "drive", drive())
     (folder / "drive_0.mcap").rename(folder / "other.mcap")
-    with pytest.raises(RecordingError, match=r"lacks drive_0.mcap, which its metadata.yaml names"):
-        open_recording([folder])
+    with open_recording([folder]) as recording:
+        assert "/image" in recording.topics
+        assert "lacks drive_0.mcap, which its metadata.yaml names: what is there is read" in recording.notes[0]
     (folder / "metadata.yaml").write_text("rosbag2_bagfile_information: [")
-    with pytest.raises(RecordingError, match="ros2 bag reindex"):
-        open_recording([folder])
+    (folder / "b.mcap").touch()
+    (folder / "c.db3").write_bytes(b"SQLite format 3")
+    with open_recording([folder]) as recording:
+        assert "/image" in recording.topics and len(recording.notes) == 3
+        assert "metadata.yaml is not what rosbag2 writes: the files beside it are read" in recording.notes[0]
+        assert recording.notes[1].startswith("b.mcap in ") and recording.notes[2].startswith("c.db3 in ")
     with pytest.raises(RecordingError, match="no recording was given"):
         open_recording([])
+
+
+def test_of_a_folder_that_was_copied_in_part_the_rest_is_read(tmp_path: Path) -> None:
+    folder = m.write_mcap(tmp_path / "drive", drive())
+    metadata = folder / "metadata.yaml"
+    metadata.write_text(metadata.read_text().replace("- drive_0.mcap", "- drive_0.mcap\n  - drive_1.mcap"))
+    with open_recording([folder]) as recording:
+        assert "/image" in recording.topics and "lacks drive_1.mcap" in recording.notes[0]
+
+
+@pytest.mark.parametrize("name", ["drive", "drive.bag", "drive.MCAP", "drive.mcap.zst"])
+def test_what_a_file_begins_with_counts_before_its_name(tmp_path: Path, name: str) -> None:
+    path = m.write_mcap(tmp_path / "a.mcap", drive())
+    content = path.read_bytes()
+    (tmp_path / name).write_bytes(zstandard.ZstdCompressor().compress(content) if name.endswith("zst") else content)
+    with open_recording([tmp_path / name]) as recording, open_recording([path]) as expected:
+        assert recording.topics == expected.topics
 
 
 def test_topics_that_are_not_there_or_of_two_types_are_named(tmp_path: Path) -> None:

@@ -17,6 +17,13 @@ from ngo_recordings.rosbag_folder import RosbagFolder
 
 PACKED = ".zstd"
 
+_MAGIC = {
+    ".mcap": b"\x89MCAP",
+    ".db3": b"SQLite format 3",
+    ".bag": b"#ROS",
+    PACKED: b"\x28\xb5\x2f\xfd",
+}
+
 
 class CopiedFile:
     """A recording that is read from a copy in a temporary folder, which goes with it.
@@ -50,7 +57,7 @@ class CopiedFile:
 
 
 def packed_file(path: Path, max_chunk_bytes: int) -> CopiedFile:
-    """A .db3.zstd or .mcap.zstd file without its metadata.yaml."""
+    """A packed .db3 or .mcap file, as without its metadata.yaml."""
     check_regular(path)
 
     def unpack(copy: Path) -> None:
@@ -58,6 +65,20 @@ def packed_file(path: Path, max_chunk_bytes: int) -> CopiedFile:
             zstandard.ZstdDecompressor().copy_stream(packed, whole)
 
     return CopiedFile(path, path.stem, unpack, max_chunk_bytes, "")
+
+
+def kind_of(path: Path) -> str:
+    """The kind of a file as the ending of its name, by what it begins with; else by its name, in small letters."""
+    try:
+        with path.open("rb") as file:
+            begin = file.read(16)
+    except OSError:
+        begin = b""
+    found = next((kind for kind, magic in _MAGIC.items() if begin.startswith(magic)), None)
+    name = path.name.lower()
+    if found is None and name.endswith((".db3.zstd", ".mcap.zstd", ".db3.zst", ".mcap.zst")):
+        return PACKED
+    return found or Path(name).suffix
 
 
 def log_of(path: Path) -> Path:

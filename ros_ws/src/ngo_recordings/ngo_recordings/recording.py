@@ -14,7 +14,7 @@ import yaml
 
 from ngo_recordings.bounds import MAX_CHUNK_BYTES, check_regular, unpacked
 from ngo_recordings.carmen_log import CarmenLog
-from ngo_recordings.copied_file import PACKED, CopiedFile, database_with_log, has_log, packed_file
+from ngo_recordings.copied_file import PACKED, CopiedFile, database_with_log, has_log, kind_of, packed_file
 from ngo_recordings.decoding import Decoder
 from ngo_recordings.errors import RecordingError
 from ngo_recordings.mcap_file import McapFile
@@ -26,6 +26,9 @@ Source = McapFile | RosbagFolder | Ros1Bag | Ros1Records | CarmenLog | CopiedFil
 _PACKED_MESSAGE = b"\x28\xb5\x2f\xfd"  # begins no message in CDR
 
 _CARMEN = (".log", ".clf", ".log.gz", ".clf.gz")
+_IN_FOLDERS = (".mcap", ".db3", PACKED)
+_EMPTY = "has nothing in it: left out"
+_OTHERS = "is not read: it is of another kind than the first file"
 _KINDS = "a .mcap, .db3 or .bag file, a CARMEN log (.log, .clf, either with .gz), or the folder of a rosbag2"
 
 
@@ -56,12 +59,12 @@ class Recording:
     they have none. notes: what a person should know about the files, one sentence each with the file's name.
     """
 
-    def __init__(self, sources: Sequence[Source]) -> None:
+    def __init__(self, sources: Sequence[Source], notes: Sequence[str] = ()) -> None:
         self._sources = [(source, Decoder(source.path, source.topics)) for source in sources]
         self.paths = tuple(source.path for source in sources)
         self.unfinished = tuple(source.path for source in sources if source.unfinished)
         self.stamps_made = tuple(source.path for source in sources if source.stamps_made)
-        self.notes = tuple(note for source in sources for note in source.notes)
+        self.notes = (*notes, *(note for source in sources for note in source.notes))
         self.topics: dict[str, TopicInfo] = {}
         for name in sorted({name for source in sources for name in source.topics}):
             stored = [source.topics[name] for source in sources if name in source.topics]
@@ -120,7 +123,7 @@ def open_recording(paths: Sequence[Path], max_chunk_bytes: int = MAX_CHUNK_BYTES
     """Open recordings, several as one in order of log time.
 
     Taken are .mcap files, rosbag2 folders (mcap or sqlite3), ROS 1 bags (.bag) and CARMEN logs (.log, .clf, .log.gz,
-    .clf.gz).
+    .clf.gz). What a file begins with counts before its name.
 
     Args:
         max_chunk_bytes: largest chunk of MCAP files and ROS 1 bags that is unpacked; memory is up to six times this.
@@ -132,27 +135,29 @@ def open_recording(paths: Sequence[Path], max_chunk_bytes: int = MAX_CHUNK_BYTES
         raise RecordingError(f"no recording was given: name {_KINDS}")
     with ExitStack() as opened:
         sources: list[Source] = []
+        notes: list[str] = []
         for path in paths:
-            for source in _open_sources(Path(path), max_chunk_bytes):
+            for source in _open_sources(Path(path), max_chunk_bytes, notes):
                 opened.callback(source.close)
                 sources.append(source)
-        recording = Recording(sources)
+        recording = Recording(sources, notes)
         opened.pop_all()
     return recording
 
 
-def _open_sources(path: Path, max_chunk_bytes: int) -> Iterator[Source]:
+def _open_sources(path: Path, max_chunk_bytes: int, notes: list[str]) -> Iterator[Source]:
     if path.is_dir():
-        yield from _open_folder(path, max_chunk_bytes)
+        yield from _open_folder(path, max_chunk_bytes, notes)
         return
     check_regular(path)
-    if path.suffix == ".mcap":
+    kind = kind_of(path)
+    if kind == ".mcap":
         yield McapFile(path, max_chunk_bytes)
-    elif path.suffix == ".db3":
+    elif kind == ".db3":
         yield _database(path, max_chunk_bytes)
-    elif path.suffix == ".bag":
+    elif kind == ".bag":
         yield _ros1_bag(path, max_chunk_bytes)
-    elif path.name.endswith((".db3" + PACKED, ".mcap" + PACKED)):
+    elif kind == PACKED:
         yield packed_file(path, max_chunk_bytes)
     elif path.name.lower().endswith(_CARMEN):
         yield CarmenLog(path)
@@ -175,16 +180,11 @@ def _ros1_bag(path: Path, max_chunk_bytes: int) -> Source:
             raise error from None
 
 
-def _open_folder(path: Path, max_chunk_bytes: int) -> Iterator[Source]:
-    """A folder whose recorder was killed has no metadata.yaml, and then its files are taken as they are."""
+def _open_folder(path: Path, max_chunk_bytes: int, notes: list[str]) -> Iterator[Source]:
+    """A folder whose recorder was killed has no metadata.yaml, or a cut one: its files are taken as they are."""
     metadata = path / "metadata.yaml"
     if not metadata.exists():
-        patterns = "*.mcap", "*.db3", "*.mcap" + PACKED, "*.db3" + PACKED
-        files = next((found for pattern in patterns if (found := sorted(path.glob(pattern)))), [])
-        if not files:
-            raise RecordingError(f"{path} is no recording: it has neither metadata.yaml nor .mcap or .db3 files")
-        for file in files:
-            yield from _open_sources(file, max_chunk_bytes)
+        yield from _open_files(path, max_chunk_bytes, notes)
         return
     check_regular(metadata)
     try:
@@ -192,13 +192,16 @@ def _open_folder(path: Path, max_chunk_bytes: int) -> Iterator[Source]:
         plain_mcap = facts["storage_identifier"] == "mcap" and not facts.get("compression_format")
         names = [Path(name).name for name in facts["relative_file_paths"]]
     except (yaml.YAMLError, ValueError, KeyError, TypeError, AttributeError, OSError, RecursionError):
-        raise RecordingError(
-            f"{metadata} is not what rosbag2 writes: make it anew with `ros2 bag reindex {path}`"
-        ) from None
+        notes.append(f"{metadata} is not what rosbag2 writes: the files beside it are read as they are")
+        yield from _open_files(path, max_chunk_bytes, notes)
+        return
+    if missing := [name for name in names if not (path / name).exists()]:
+        notes.append(f"{path} lacks {', '.join(missing)}, which its metadata.yaml names: what is there is read")
+        yield from _open_files(path, max_chunk_bytes, notes)
+        return
     if not plain_mcap:
         for name in names:
-            if (path / name).exists():  # what is missing is told by the library
-                check_regular(path / name)
+            check_regular(path / name)
         if any(has_log(path / name) for name in names):
             for name in names:
                 yield _database(path / name, max_chunk_bytes)
@@ -206,9 +209,21 @@ def _open_folder(path: Path, max_chunk_bytes: int) -> Iterator[Source]:
         yield RosbagFolder(path)
         return
     for name in names:
-        if not (path / name).exists():
-            raise RecordingError(f"{path} lacks {name}, which its metadata.yaml names: copy it, too")
         yield McapFile(path / name, max_chunk_bytes)
+
+
+def _open_files(path: Path, max_chunk_bytes: int, notes: list[str]) -> Iterator[Source]:
+    """The recordings of one kind that lie in a folder; those that are empty are named."""
+    there = sorted(file for file in path.iterdir() if file.is_file())
+    kinds = {file: kind_of(file) for file in there if file.stat().st_size}
+    files = next((found for kind in _IN_FOLDERS if (found := [file for file in kinds if kinds[file] == kind])), [])
+    if not files:
+        raise RecordingError(f"{path} is no recording: it has no .mcap or .db3 files")
+    empty = [file.name for file in there if file.suffix in _IN_FOLDERS and file not in kinds]
+    others = [file.name for file in kinds if kinds[file] in _IN_FOLDERS and file not in files]
+    notes += [f"{', '.join(names)} in {path} {why}" for names, why in ((empty, _EMPTY), (others, _OTHERS)) if names]
+    for file in files:
+        yield from _open_sources(file, max_chunk_bytes, notes)
 
 
 def _decoded(source: Source, decoder: Decoder, names: set[str]) -> Iterator[Message]:
