@@ -41,10 +41,10 @@ def test_the_table_has_ten_drives_a_row_and_keeps_what_is_not_measured(
     monkeypatch.setattr(results_lifelong, "patrol", lambda year, identity: a_year(year.drives))
     folders: dict[str, Any] = {name: tmp_path / name for name in ("out", "docs", "runs")}
     folders["out"].mkdir()
-    (folders["out"] / "lifelong.json").write_text('{"tables": {"join": {}}}')
+    (folders["out"] / "lifelong.json").write_text('{"tables": {"other": {}}}')
     chosen = results_lifelong.Arguments(split="validation", tables=("year",), years=2, drives=30, **folders)
     result = results_lifelong.main(chosen)
-    assert set(result["tables"]) == {"join", "year"}
+    assert set(result["tables"]) == {"other", "year"}
     assert list(result["tables"]["year"]) == ["first_ten", "eleven_to_twenty", "last_ten"]
     means = [row["ate_m"]["mean"] for row in result["tables"]["year"].values()]
     assert means == pytest.approx([40.0 / 9.0, 14.5, 24.5])

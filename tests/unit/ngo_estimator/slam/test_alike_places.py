@@ -2,9 +2,11 @@
 
 import numpy as np
 
+from ngo_estimator.geometry.planar_motion import between
 from ngo_estimator.loops.key_scan_views import KeyScanViews
 from ngo_estimator.loops.scan_settings import ScanLoopConfig
-from ngo_estimator.slam.alike_places import MOST_ALIKE, alike_share
+from ngo_estimator.slam.scan_matcher import REACH_M, ScanMatcher
+from tests.unit.ngo_estimator.lidar_steps import lidar_steps
 from tests.unit.ngo_estimator.loops.buildings import HALLWAY, ROUND, outline, scan_at, way
 
 ROOM = np.concatenate(
@@ -18,15 +20,23 @@ ROOM = np.concatenate(
 IN_AND_OUT = ((0.5, 1), (2.5, 1), (2.5, 4.2), (2.5, 1))
 
 
-def share(walls: np.ndarray, poses: np.ndarray) -> float:
+def matcher_of(walls: np.ndarray, poses: np.ndarray) -> ScanMatcher:
     random = np.random.default_rng(0)
     scans = [scan_at(walls, pose, random) for pose in poses]
-    views = KeyScanViews().of_map(scans)
-    return alike_share(np.arange(len(poses)), scans, views, poses, ScanLoopConfig())
+    return ScanMatcher(scans, poses, KeyScanViews().of_map(scans), ScanLoopConfig(), REACH_M)
 
 
 def test_rooms_that_look_alike_are_noticed_and_corners_of_a_ring_are_told_apart() -> None:
     rooms = np.concatenate([ROOM + (x, 0, x, 0) for x in (0, 7, 14)])
-    through = way(*[(x + dx, y) for x in (0, 7, 14) for dx, y in IN_AND_OUT])
-    assert share(rooms, through) > MOST_ALIKE
-    assert share(HALLWAY, way(*ROUND, ROUND[0])) < MOST_ALIKE
+    assert matcher_of(rooms, way(*[(x + dx, y) for x in (0, 7, 14) for dx, y in IN_AND_OUT])).has_alike_places()
+    assert not matcher_of(HALLWAY, way(*ROUND, ROUND[0])).has_alike_places()
+
+
+def test_a_way_confirms_its_place_by_the_walls_that_it_has_in_common_with_the_map() -> None:
+    matcher, again = matcher_of(HALLWAY, way(*ROUND, ROUND[0])), way(*ROUND)[:40]
+    random = np.random.default_rng(1)
+    odometry = np.array([between(again[0], pose) for pose in again])
+    for step in lidar_steps(odometry, lambda k, stamp_ns: scan_at(HALLWAY, again[k], random)):
+        matcher.append(step, step.odom_xyyaw)
+    assert matcher.confirms(again[-1]) is True
+    assert not matcher.confirms(again[-1] + (2.0, 0.0, 0.0)) and not matcher.confirms(again[-1] + (0.0, 0.0, np.pi))

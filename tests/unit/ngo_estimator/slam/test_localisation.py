@@ -28,6 +28,7 @@ class Map:
         self.copies, self.pose, self.blind = [np.array(copy) for copy in copies], np.zeros(3), False
         self._random = np.random.default_rng(seed)
         self.asked = 0
+        self.confirmed: bool | None = None
 
     def append(self, step: RelativeStep, odometry: np.ndarray) -> bool:
         return True
@@ -45,6 +46,9 @@ class Map:
 
     def around(self, expected: np.ndarray) -> Sightings:
         return Sightings.none()
+
+    def confirms(self, pose: np.ndarray) -> bool | None:
+        return self.confirmed
 
 
 class Anywhere(Map):
@@ -86,6 +90,18 @@ def test_a_start_in_the_middle_of_the_map_is_found_and_followed() -> None:
     assert metres < 0.05 and radians < 0.02
     assert found[-1].covariance is not None and (np.linalg.eigvalsh(found[-1].covariance) > 0.0).all()
     assert np.sqrt(found[-1].covariance[0, 0]) < 0.05
+
+
+def test_a_matcher_that_confirms_a_pose_makes_few_looks_enough_and_one_that_does_not_forbids_a_claim() -> None:
+    first = {}
+    for confirmed in (True, None):
+        at = Map()
+        at.confirmed = confirmed
+        first[confirmed] = [one.claimed for one in drive(Localiser(at), at, 40)].index(True)
+    assert first[True] < 10 < first[None] < 20
+    at = Map()
+    at.confirmed = False
+    assert not any(one.claimed for one in drive(Localiser(at), at, 60))
 
 
 @pytest.mark.parametrize("copy", [(8.0, 1.0, 0.0), (0.0, 0.0, math.pi), (3.0, 0.0, math.pi / 2.0)])

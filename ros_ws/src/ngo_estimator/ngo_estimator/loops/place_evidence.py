@@ -4,7 +4,7 @@ Scans that fit say little: a corridor with a corner is in every building. What c
 have, and whether either looks through walls of the other, anywhere on the stretch and not only where scans fit.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -23,8 +23,8 @@ _THICK_M, _PARALLEL = 0.1, 0.95
 _WALL_POINTS = 4
 """Points, one a cell, that make a wall."""
 
-_STRETCH_M, _PART = 20.0, 4
-"""The way that is compared, and of how many key scans a part of it is."""
+STRETCH_M, _PART = 20.0, 4
+"""The way that is compared at most, and of how many key scans a part of it is."""
 
 _NEAR_M, _MOST_SCANS = 8.0, 60
 """The key scans that it is compared with: how far from it, and how many at most."""
@@ -38,6 +38,9 @@ _SAID = 40
 _LEAST_WALLS, _MOST_MEAN, MOST_THROUGH = 8, 0.15, 0.33
 """A claim needs so many different walls. The way may look through so much of the walls in the mean, and each of its
 parts through so much at most."""
+
+_CLEAR_MEAN = 0.07
+"""A way that was just driven looks through so much of the walls of a good map at most: doors, people and furniture."""
 
 
 @dataclass(frozen=True)
@@ -62,6 +65,11 @@ class PlaceEvidence:
         """Whether a stretch of the way and a place have enough in common, and contradict each other little."""
         return self.walls >= _LEAST_WALLS and self.mean <= _MOST_MEAN and self.through <= MOST_THROUGH
 
+    @property
+    def is_clear(self) -> bool:
+        """Whether they do not even contradict each other as little as a map may that is still being made."""
+        return self.suffices and self.mean <= _CLEAR_MEAN
+
 
 NO_EVIDENCE = PlaceEvidence(0, 0.0, 0)
 """Of a stretch that comes nowhere near the place."""
@@ -80,24 +88,39 @@ def evidence_of(
     Of the others ``most_scans`` are compared.
     """
 
-    def together(keys: np.ndarray, poses: np.ndarray) -> PlacedScans:
-        chosen = keys.tolist()
-        return placed([scans[key] for key in chosen], [views.profiles[key] for key in chosen], poses)
-
     keys, at = stretch
+
+    def part(which: slice) -> PlacedScans:
+        chosen = keys[which].tolist()
+        return placed([scans[key] for key in chosen], [views.profiles[key] for key in chosen], at[which])
+
+    return evidence_at(scans, views, (at, part), others, most_scans, count_walls)
+
+
+def evidence_at(
+    scans: Sequence[KeyScan],
+    views: KeyScanViews,
+    stretch: tuple[np.ndarray, Callable[[slice], PlacedScans]],
+    others: tuple[np.ndarray, np.ndarray],
+    most_scans: int = _MOST_SCANS,
+    count_walls: bool = False,
+) -> PlaceEvidence:
+    """The same of a stretch whose scans are not among ``scans``: its poses ``(n, 3)``, and what gives some of them."""
+    at, part = stretch
     near = np.flatnonzero(_near(others[1], at))
     near = near[:: max(1, -(-len(near) // most_scans))]
     if not len(near):
         return NO_EVIDENCE
-    parts = [slice(first, first + _PART) for first in range(0, len(keys), _PART)]
-    place = together(others[0][near], others[1][near])
-    return place_evidence(place, [together(keys[p], at[p]) for p in parts], count_walls)
+    chosen = others[0][near].tolist()
+    place = placed([scans[key] for key in chosen], [views.profiles[key] for key in chosen], others[1][near])
+    parts = [part(slice(first, first + _PART)) for first in range(0, len(at), _PART)]
+    return place_evidence(place, parts, count_walls)
 
 
-def last_stretch(poses: np.ndarray, first: int) -> np.ndarray:
-    """The keys from ``first`` on that lie on the last stretch of the way of poses ``(keys, 3)``."""
+def last_stretch(poses: np.ndarray, first: int, most_m: float = STRETCH_M) -> np.ndarray:
+    """The keys from ``first`` on that lie on the last ``most_m`` of the way of poses ``(keys, 3)``."""
     to_end = np.cumsum(np.hypot(*np.diff(poses[first:, :2], axis=0)[::-1].T))
-    return np.arange(len(poses) - 1 - int(np.searchsorted(to_end, _STRETCH_M)), len(poses))
+    return np.arange(len(poses) - 1 - int(np.searchsorted(to_end, most_m)), len(poses))
 
 
 def place_evidence(place: PlacedScans, stretch: Sequence[PlacedScans], count_walls: bool = True) -> PlaceEvidence:

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -50,22 +50,24 @@ class LocalisationConfig:
     """Share of the window that must support a claim, 0 to 1."""
     least_way_places: float = 3.0
     """Path over which the support must be spread (places)."""
+    sure_support: float = 3.0
+    """Looks that are enough where the matcher confirms a pose."""
+    sure_way_places: float = 1.0
+    """Path that is enough then (places)."""
     most_rival: float = 0.35
     """Support of another pose at most, as a share of the claim's, 0 to below 1."""
     lost_places: float = 2.0
     """Deviation of the position past which a pose is lost (places)."""
 
     def __post_init__(self) -> None:
-        positive = (self.look_places, self.look_deg, self.least_support, self.lost_places)
-        if not all(0.0 < value < math.inf for value in positive):
-            raise ValueError(
-                f"look_places, look_deg, least_support, lost_places are {positive}; expected positive numbers"
-            )
-        if self.window < 2 or not 0.0 <= self.least_way_places < math.inf:
-            raise ValueError(
-                f"window, least_way_places are {self.window}, {self.least_way_places}; expected at least 2, and a "
-                "length from 0 on"
-            )
+        names = ("look_places", "look_deg", "least_support", "sure_support", "lost_places")
+        if not all(0.0 < getattr(self, name) < math.inf for name in names):
+            raise ValueError(f"{', '.join(names)} are {[getattr(self, n) for n in names]}; expected positive numbers")
+        if self.window < 2:
+            raise ValueError(f"window is {self.window}; expected at least 2")
+        ways = (self.least_way_places, self.sure_way_places)
+        if not all(0.0 <= way < math.inf for way in ways):
+            raise ValueError(f"least_way_places, sure_way_places are {ways}; expected lengths from 0 on")
         if not (0.0 <= self.most_rival < 1.0 and 0.0 <= self.least_share <= 1.0):
             raise ValueError(
                 f"most_rival, least_share are {self.most_rival}, {self.least_share}; expected shares of one, the first "
@@ -94,7 +96,11 @@ class Localiser:
     """Takes steps, and reports where in the map the robot is once that is beyond doubt."""
 
     def __init__(self, matcher: MapMatcher, config: LocalisationConfig | None = None) -> None:
-        self.config = config or LocalisationConfig()
+        self.config = config = config or LocalisationConfig()
+        # What confirms a pose has asked all frames, and not only those with sightings.
+        self._sure = replace(
+            config, least_support=config.sure_support, least_way_places=config.sure_way_places, least_share=0.0
+        )
         self._matcher = matcher
         self._window = HypothesisWindow(self.config.window)
         self.reset()
@@ -172,7 +178,14 @@ class Localiser:
             self._track = fused(seen, *self._track)
 
     def _may_claim(self, mode: Mode, others: Sequence[Mode]) -> bool:
-        return may_claim(self.config, self._window, mode, others, self._matcher.place_m, len(self._window))
+        enough = self._supported(self.config, mode, others)
+        if not (enough or self._supported(self._sure, mode, others)):
+            return False
+        confirmed = self._matcher.confirms(mode.pose_xyyaw)
+        return enough if confirmed is None else confirmed
+
+    def _supported(self, config: LocalisationConfig, mode: Mode, others: Sequence[Mode]) -> bool:
+        return may_claim(config, self._window, mode, others, self._matcher.place_m, len(self._window))
 
     def _contradicted(self, hypotheses: Hypotheses, agree: np.ndarray) -> bool:
         """Whether the track is lost; ``agree`` says which hypotheses agree with it."""
@@ -186,7 +199,7 @@ class Localiser:
         others = [mode for mode in self._modes if not _same(mode, self._track[0], place_m)]
         if len(others) == len(self._modes) and self._modes:
             track = Mode(*self._track, ours, np.zeros(0, np.int64))
-            return self._may_claim(others[0], (*others[1:], track))
+            return self._supported(self.config, others[0], (*others[1:], track))
         return False
 
 

@@ -24,20 +24,13 @@ from ngo_estimator.loops.place_evidence import MOST_THROUGH, PlaceEvidence, evid
 from ngo_estimator.loops.scan_loops import EVIDENCE, ScanLoops
 from ngo_estimator.loops.scan_settings import ScanGraphConfig
 from ngo_estimator.loops.scan_submaps import laid_together
-from ngo_estimator.slam.alike_places import MOST_ALIKE, alike_share
 from ngo_estimator.slam.evidence import HypothesisWindow, agreeing, fused, strongest_modes
 from ngo_estimator.slam.localisation import LocalisationConfig, may_claim
-from ngo_estimator.slam.scan_matcher import ScanMatcher
+from ngo_estimator.slam.scan_matcher import REACH_M, WAY_KEYS, ScanMatcher
 from ngo_estimator.slam.sightings import Sightings
-
-_REACH_M = 2.0
-"""How far the robot is from where it was before, where it is found."""
 
 _GROWN = 1.1
 """The map is laid out anew when so many times as many key scans are to be searched."""
-
-_WAY_KEYS = 400
-"""Of a way's last so many key scans is asked whether places look alike there."""
 
 _TRIAL_LOOKS, _CONTRADICTIONS = 40, 3
 """Looks after a claim in which the newest scans may still contradict it, and how many in a row do."""
@@ -146,8 +139,9 @@ class OwnMap:
         """Whether places look alike on the robot's own way, or on that of a key scan where it would be found."""
         ends = np.append(graph.segments, len(graph))
         for segment in {int(segment_of(graph.segments, np.array(there))), len(graph.segments) - 1}:
-            way = np.arange(max(ends[segment], ends[segment + 1] - _WAY_KEYS), ends[segment + 1])
-            if alike_share(way, scans, views, graph.poses, self._config.loops) > MOST_ALIKE:
+            way = np.arange(max(ends[segment], ends[segment + 1] - WAY_KEYS), ends[segment + 1])
+            matcher = self._searching(way, graph.poses[way], scans, views)
+            if matcher and matcher.has_alike_places():
                 return True
         return False
 
@@ -236,11 +230,17 @@ class OwnMap:
     def _matcher_of(self, scans: Sequence[KeyScan], views: KeyScanViews) -> ScanMatcher | None:
         """What searches in them; None where none of them has a point."""
         if self._matcher is None:
-            keys = self._keys.tolist()
-            chosen, config = [scans[key] for key in keys], self._config.loops
-            if any(len(scan.points) for scan in chosen):
-                self._matcher = ScanMatcher(chosen, self._poses, views.of_keys(keys), config, _REACH_M)
+            self._matcher = self._searching(self._keys, self._poses, scans, views)
         return self._matcher
+
+    def _searching(
+        self, keys: np.ndarray, poses: np.ndarray, scans: Sequence[KeyScan], views: KeyScanViews
+    ) -> ScanMatcher | None:
+        """What searches in key scans ``(n,)`` at poses ``(n, 3)``; None where none of them has a point."""
+        chosen = [scans[key] for key in keys.tolist()]
+        if not any(len(scan.points) for scan in chosen):
+            return None
+        return ScanMatcher(chosen, poses, views.of_keys(keys.tolist()), self._config.loops, REACH_M)
 
     def _laid_anew(self, seen: Sightings, keys: np.ndarray, poses: np.ndarray) -> Sightings:
         """Sightings in a map that lay otherwise: each goes with the key scan that was nearest."""

@@ -83,6 +83,9 @@ class PlaceMatcher:
         there = torch.from_numpy(expected)
         return self._by_places(self._nearby(self._similarity(), there)).and_also(self._by_overlaps(there))
 
+    def confirms(self, pose: np.ndarray) -> None:
+        """Nothing is known of frames but their place codes."""
+
     def _similarity(self) -> Tensor:
         newest = torch.from_numpy(self._codes.slice(len(self._codes) - 1))
         return self._embeddings @ self._pair_head.embed(newest)[0]

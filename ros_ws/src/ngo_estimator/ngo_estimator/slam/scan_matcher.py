@@ -11,14 +11,17 @@ from dataclasses import replace
 import numpy as np
 
 from ngo_estimator.data.relative_step import RelativeStep
+from ngo_estimator.geometry import se2
 from ngo_estimator.geometry.branch_and_bound import pooled_grid, search
 from ngo_estimator.geometry.key_scan import KeyScan
 from ngo_estimator.geometry.planar_motion import between, compose, transformed, turned_covariance
 from ngo_estimator.loops.key_scan_views import KeyScanViews
+from ngo_estimator.loops.place_evidence import STRETCH_M, PlaceEvidence, evidence_at, evidence_of, last_stretch
 from ngo_estimator.loops.scan_fit import fit, search_points
 from ngo_estimator.loops.scan_settings import ScanLoopConfig
 from ngo_estimator.loops.scan_submaps import SUBMAP_VARIANCE, ScanSubmaps, laid_together
-from ngo_estimator.loops.walls_seen_through import PlacedScans, range_profile
+from ngo_estimator.loops.walls_seen_through import PlacedScans, placed, range_profile
+from ngo_estimator.slam.evidence import elsewhere
 from ngo_estimator.slam.sightings import Sightings
 
 _MARGIN_M = 2.0  # around the key scans of the map, where the robot may be
@@ -26,6 +29,16 @@ _SEARCHED = 150  # points in the whole map; a pose that fits is verified with mo
 _SEARCHED_NEAR, _MOST_BLOCKS_NEAR = 60, 12_000  # the same near the key scans, and how many blocks are split at most
 _LEAST_NEAR, _LEAST_SECOND_NEAR = 0.45, 0.75  # likelihoods that are distinguished there
 _AROUND = np.array((1.0, 1.0, math.radians(15.0)))  # of a pose that is verified
+_MOST_RECENT = 64  # key scans of the way that are kept
+
+REACH_M = 2.0
+"""How far the robot is from where a robot was before, where it is found in a map that grows."""
+
+WAY_KEYS, _ALIKE_LOOKS = 400, 24
+"""Of a way's key scans is asked whether places look alike: of so many together, at so many places."""
+
+_MOST_ALIKE = 0.1
+"""Where a larger share of places is alike, what looks the same may be another place."""
 
 
 class ScanMatcher:
@@ -57,6 +70,7 @@ class ScanMatcher:
         self._scans, self._poses, self._views = scans, poses, views.of_map(scans)
         self._config, self._borders = config, borders
         self._submaps = ScanSubmaps(config)
+        self._ambiguous: dict[tuple[int, float], bool] = {}
         together = np.concatenate(points)
         if reach_m < math.inf:  # a map that grows is made again and again
             together = _one_a_cell(together, 0.5 * config.search.resolution_m)
@@ -84,10 +98,9 @@ class ScanMatcher:
         """Take the next frame and its pose ``(3,)`` by odometry; only key scans are compared with the map."""
         if step.key is None:
             return False
-        keep = self._config.source_keys
-        self._recent = [*self._recent, step.key.scan][-keep:]
-        self._odometry = [*self._odometry, odometry][-keep:]
-        return len(self._recent) == keep
+        self._recent = [*self._recent, step.key.scan][-_MOST_RECENT:]
+        self._odometry = [*self._odometry, odometry][-_MOST_RECENT:]
+        return len(self._recent) >= self._config.source_keys
 
     def everywhere(self) -> Sightings:
         """Hypotheses of the newest frame's pose, wherever it may be: the best one, and the best well apart from it."""
@@ -109,8 +122,72 @@ class ScanMatcher:
         """Hypotheses of the newest frame's pose, which should be near ``expected`` ``(3,)``."""
         return self._verified(self._source(), (expected,))
 
+    def confirms(self, pose: np.ndarray) -> bool | None:
+        """Whether the newest frame is at a pose, beside what sightings say: by the walls that its way and the map have.
+
+        Where these are few, sightings may be of another place that looks the same, if there are such places.
+        """
+        if self._evidence(pose).is_clear:
+            return True
+        there = int(np.linalg.norm(self._poses[:, :2] - pose[:2], axis=1).argmin())
+        return False if self._is_ambiguous(there // WAY_KEYS) else None
+
+    def _is_ambiguous(self, part: int) -> bool:
+        """Whether places look alike in a part of the map, to a robot that has seen as much as this one."""
+        steps = np.diff(np.stack(self._odometry)[:, :2], axis=0)
+        way_m = min(STRETCH_M, float(np.ceil(np.hypot(*steps.T).sum())))
+        if (part, way_m) not in self._ambiguous:
+            keys = slice(part * WAY_KEYS, (part + 1) * WAY_KEYS)
+            scans, views = self._scans[keys], self._views.of_keys(range(*keys.indices(len(self._scans))))
+            searched = any(len(scan.points) for scan in scans) and ScanMatcher(
+                scans, self._poses[keys], views, self._config, REACH_M
+            )
+            self._ambiguous[part, way_m] = bool(searched and searched.has_alike_places(way_m))
+        return self._ambiguous[part, way_m]
+
+    def has_alike_places(self, way_m: float = STRETCH_M) -> bool:
+        """Whether places look alike in the map: it is searched in itself, where the truth is known.
+
+        Two robots that have been in one room each cannot know whether it is the same room. A robot that has seen
+        several rooms knows whether rooms are alike here: the evidence for a claim is asked about places that are
+        certainly others. The map is one way, whose key scans follow each other and whose poses are sure of each other.
+        The evidence is that of ``way_m`` of it.
+        """
+        before = self._config.source_keys - 1
+        if len(self._scans) <= before:
+            return False
+        looks = np.unique(np.linspace(before, len(self._scans) - 1, _ALIKE_LOOKS).astype(np.int64))
+        return sum(self._is_alike(key, way_m) for key in looks.tolist()) > _MOST_ALIKE * len(looks)
+
+    def _is_alike(self, key: int, way_m: float) -> bool:
+        """Whether the evidence for a key scan's place would suffice at another place, too."""
+        scans, views, poses = self._scans, self._views, self._poses
+        source = slice(key + 1 - self._config.source_keys, key + 1)
+        seen = self.search(laid_together(scans[source], views.profiles[source], poses[source])).poses
+        stretch = last_stretch(poses[: key + 1], 0, way_m)
+        since = se2.between(poses[key], poses[stretch])
+        others = (se2.compose(pose, since) for pose in seen[elsewhere(seen, poses[key], self.place_m)])
+        place = np.arange(len(scans)), poses
+        return any(evidence_of(scans, views, (stretch, at), place, count_walls=True).suffices for at in others)
+
+    def _evidence(self, pose: np.ndarray) -> PlaceEvidence:
+        """How the last stretch of the way agrees with the map, where the newest frame is at ``pose`` ``(3,)``."""
+        odometry = np.stack(self._odometry)
+        stretch = last_stretch(odometry, 0)
+        at = se2.compose(pose, se2.between(odometry[-1], odometry[stretch]))
+        scans = self._recent[int(stretch[0]) :]
+
+        def part(which: slice) -> PlacedScans:
+            return placed(scans[which], list(map(range_profile, scans[which])), at[which])
+
+        return evidence_at(
+            self._scans, self._views, (at, part), (np.arange(len(self._scans)), self._poses), count_walls=True
+        )
+
     def _source(self) -> PlacedScans:
-        return laid_together(self._recent, [range_profile(scan) for scan in self._recent], np.stack(self._odometry))
+        newest = slice(-self._config.source_keys, None)
+        scans = self._recent[newest]
+        return laid_together(scans, [range_profile(scan) for scan in scans], np.stack(self._odometry[newest]))
 
     def _verified(self, source: PlacedScans, poses: Sequence[np.ndarray]) -> Sightings:
         seen = [self._seen(source, pose) for pose in poses]

@@ -60,5 +60,11 @@ class MapMatcher(Protocol):
     def around(self, expected: np.ndarray) -> Sightings:
         """Hypotheses of the newest frame's pose, which should be near ``expected`` ``(3,)``."""
 
+    def confirms(self, pose: np.ndarray) -> bool | None:
+        """Whether the newest frame is at a pose ``(3,)`` that sightings agree on, by what else is known.
+
+        True: fewer sightings are enough. False: no number of them is. None: nothing else is known.
+        """
+
     def reset(self) -> None:
         """Forget all frames but those of the map."""
