@@ -250,11 +250,11 @@ def test_what_a_graph_predicts_of_loops_is_as_sure_as_dense_matrices_say() -> No
 
 
 def outvoted() -> tuple[GraphProblem, np.ndarray]:
-    """Thrice as many loops as right ones say of each place that the robot was three steps, 3 m, farther on."""
+    """Four times as many loops as right ones say of each place that the robot was three steps, 3 m, farther on."""
     problem, true = square(3, 5)
     right = problem.loops[np.argsort(problem.loops.nodes[:, 0], kind="stable")]
     ahead = np.stack((right.nodes[:, 0], np.minimum(right.nodes[:, 1] + 3, len(true) - 1)), axis=1)
-    loops = right[::3].extended(replace(right, nodes=ahead))
+    loops = right[::4].extended(replace(right, nodes=ahead))
     return replace(problem, loops=loops, trust=np.ones(len(loops))), true
 
 

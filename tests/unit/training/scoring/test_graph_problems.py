@@ -9,6 +9,8 @@ import pytest
 
 from ngo_estimator.geometry.se2 import between, compose
 from ngo_estimator.graph.corrector import GraphProblem
+from ngo_estimator.graph.cycle_agreement import ChainUncertainty
+from ngo_estimator.graph.loop_evidence import map_area, scale_and_inlier_ratio
 from ngo_estimator.graph.robust import Robust
 from training import results_graphs
 from training.baselines import graph_peers
@@ -30,6 +32,16 @@ def test_a_graph_has_the_share_of_wrong_loops_that_was_asked_for(kind: str) -> N
 def test_a_place_alone_knows_no_heading() -> None:
     judged = synthetic("random", 30.0, 400, False, 0)
     assert (judged.problem.loops.degrees == 2).all()
+
+
+def test_wrong_loops_near_each_other_do_not_pass_for_right_ones_with_large_variances() -> None:
+    """Chains between right loops are so long that these fit without being sure; wrong ones have short chains."""
+    problem = synthetic("local", 67.0, 3333, True, 0, hard=True).problem
+    chain, area = ChainUncertainty(problem.steps), map_area(problem.poses)
+    scale, inlier_ratio = scale_and_inlier_ratio(chain, problem.loops, area)
+    assert 0.5 < scale < 2.0 and inlier_ratio < 0.4
+    scale, _ = scale_and_inlier_ratio(ChainUncertainty(problem.steps.scaled(0.02)), problem.loops.scaled(0.02), area)
+    assert 25.0 < scale < 100.0
 
 
 def test_the_error_is_that_after_the_best_alignment() -> None:
