@@ -2,6 +2,9 @@
 
     python -m training.results --world camera --split validation
     python -m training.results --world camera
+    python -m training.results --world camera --named take_cover MAP27
+
+Drives that ``camera.json`` has of the same revision and settings are not measured again.
 
 A drive of the explorer on each map. The motion given is that of wheels with errors (``given_motion``). The command
 prints a table and writes ``training/results/camera.json``: each drive, and rows with means over drives.
@@ -48,6 +51,7 @@ class Arguments:
     seeds: int = 1  # Drives of each map.
     frames: int = 1000  # Frames of a drive.
     maps: int = 0  # Number of maps; 0: all.
+    named: tuple[str, ...] = ()  # Words of which one is in the name of each map to measure, as take_cover; none: all.
     results: Path = Path("training/results")  # Folder of camera.json.
 
     def __post_init__(self) -> None:
@@ -155,19 +159,41 @@ def main(arguments: Arguments) -> dict[str, Any]:
         "graph": asdict(PictureGraphConfig()),
         "drives": {},
     }
-    name = "camera.json" if arguments.split == "test" else "camera.validation.json"
+    path = arguments.results / ("camera.json" if arguments.split == "test" else "camera.validation.json")
+    result["drives"] = _measured_before(path, result)
     first = _FIRST_SEED[arguments.split]
     for number, of in enumerate(_MAPS[arguments.split][: arguments.maps or None]):
         for seed in range(first, first + arguments.seeds):
-            one, title = drive(of, seed, arguments.frames), f"{of[0].removesuffix('.wad')} {of[1]} {seed}"
+            title = f"{of[0].removesuffix('.wad')} {of[1]} {seed}"
+            if title in result["drives"] or not any(word in title for word in arguments.named or ("",)):
+                continue
+            one = drive(of, seed, arguments.frames)
             result["drives"][title] = measured(one, given_motion(one.truth, seed + 100 * number))
             print(_line(title, result["drives"][title]), flush=True)
-            result["median"] = _medians(list(result["drives"].values()))
-            if len(result["drives"]) > 1:
-                result["tables"] = {"doom": _rows(list(result["drives"].values()))}
-            write_whole(arguments.results / name, json.dumps(result, indent=1, default=str) + "\n")
+            _write(path, result)
+    _write(path, result)
     print(_line(f"median, {len(result['drives'])} drives", result["median"]))
     return result
+
+
+def _write(path: Path, result: dict[str, Any]) -> None:
+    """Sum the drives up, and write all."""
+    drives = list(result["drives"].values())
+    result["median"] = _medians(drives)
+    if len(drives) > 1:
+        result["tables"] = {"doom": _rows(drives)}
+    write_whole(path, json.dumps(result, indent=1, default=str) + "\n")
+
+
+def _measured_before(path: Path, wanted: dict[str, Any]) -> dict[str, dict[str, float]]:
+    """The drives that a file has of this revision, with these settings and as many frames."""
+    if not path.exists():
+        return {}
+    before = json.loads(path.read_text())
+    told = json.loads(json.dumps(wanted, default=str))
+    same = all(before.get(name) == told[name] for name in ("revision", "odometry", "graph"))
+    frames = before["arguments"]["frames"] == wanted["arguments"]["frames"]
+    return dict(before["drives"]) if same and frames else {}
 
 
 def _rows(drives: list[dict[str, float]]) -> dict[str, dict[str, Any]]:
