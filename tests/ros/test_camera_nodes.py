@@ -9,15 +9,16 @@ from nav_msgs.msg import Odometry
 from ngo_msgs.msg import RelativePose
 from rclpy.qos import DurabilityPolicy, QoSProfile
 from scipy.spatial.transform import Rotation
-from sensor_msgs.msg import CameraInfo, Image
+from sensor_msgs.msg import CameraInfo, Image, PointCloud2
 from tf2_msgs.msg import TFMessage
 
 from ngo_estimator.data.relative_step import RelativeStep
 from ngo_estimator.frontend.camera.picture_odometry import PictureOdometry
+from ngo_estimator.geometry import se2
 from ngo_estimator.geometry.camera_model import CameraModel
 from ngo_estimator.nodes.messages import to_ns, to_time
 from ngo_estimator.slam.picture_trajectory import PictureTrajectory
-from tests.unit.ngo_estimator.rendered_room import by_wheels, camera, drive, picture, rays_of
+from tests.unit.ngo_estimator.rendered_room import SIZE_M, by_wheels, camera, drive, picture, rays_of
 
 from .processes import NodeProcess, Probe
 
@@ -67,6 +68,7 @@ def test_live_nodes_follow_a_camera_as_the_cores_do() -> None:
     with Probe() as probe:
         steps = probe.collect(RelativePose, "relative_pose")
         poses = probe.collect(PoseWithCovarianceStamped, "ngo/pose")
+        clouds = probe.collect(PointCloud2, "points")
         latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
         static = probe.node.create_publisher(TFMessage, "/tf_static", latched)
         infos = probe.node.create_publisher(CameraInfo, "camera/camera_info", 1000)
@@ -95,6 +97,12 @@ def test_live_nodes_follow_a_camera_as_the_cores_do() -> None:
             last_ns = BEGIN_NS + (FRAMES - 1) * STEP_NS
             probe.spin_until(lambda: to_ns(poses[-1].header.stamp) == last_ns, "the last pose")
             local.wait_for_log("camera: 160 x 120")
+            probe.spin_until(lambda: clouds and to_ns(clouds[-1].header.stamp) == last_ns, "the last points")
+    points = np.frombuffer(bytes(clouds[-1].data), "<f4").reshape(-1, 3)
+    np.testing.assert_allclose(points, core.points, atol=0.05)
+    on_wall = np.abs(se2.compose(truth[-1], np.column_stack((points[:, :2], np.zeros(len(points)))))[:, :2])
+    walls = np.column_stack((on_wall, SIZE_M[:2] - on_wall, points[:, 2], SIZE_M[2] - points[:, 2]))
+    assert len(points) > 20 and np.median(np.abs(walls).min(1)) < 0.1
     for step, message in zip(expected, steps, strict=True):
         assert to_ns(message.header.stamp) == step.stamp_ns
         np.testing.assert_allclose((message.x, message.y, message.yaw), step.relative_xyyaw, atol=1e-3)

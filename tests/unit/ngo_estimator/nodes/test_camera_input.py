@@ -34,7 +34,10 @@ class Robot:
         self.dropped: list[str] = []
         self._topics: dict[str, Callable[[Any], None]] = {}
         logger = SimpleNamespace(info=self.said.append, warning=self.said.append)
-        node: Any = SimpleNamespace(resolve_topic_name="/{}".format, get_logger=lambda: logger)
+        nobody = SimpleNamespace(get_subscription_count=lambda: 0)
+        node: Any = SimpleNamespace(
+            resolve_topic_name="/{}".format, get_logger=lambda: logger, create_publisher=lambda *_, **__: nobody
+        )
         status: Any = SimpleNamespace(received=lambda stamp_ns: None, dropped=self._drop)
         listening: Any = SimpleNamespace(to=self._listen, to_all=self._listen)
         settings = LocalNodeSettings(

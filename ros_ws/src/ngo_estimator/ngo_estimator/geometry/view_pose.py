@@ -60,6 +60,12 @@ class RangedRays:
         return RangedRays(self.origins[which], self.rays[which], self.inverse[which], self.inverse_std[which])
 
 
+    @property
+    def known(self) -> np.ndarray:
+        """Which ranges are known well enough to tell a position ``(n,)``."""
+        return self.inverse_std < _RANGED * self.inverse
+
+
 @dataclass(frozen=True, eq=False)
 class ViewPose:
     """A fitted ``pose`` ``(3,)``, its ``covariance`` ``(3, 3)`` in the frame of the points, and ``inlier`` ``(n,)``.
@@ -161,7 +167,7 @@ def fit_view(
     """
     mean, information = prior
     state = np.append(start, (0.0, 0.0))  # x, y, yaw; rise; share of the scale
-    unknown, inverse = points.inverse_std > _RANGED * points.inverse, points.inverse.copy()
+    unknown, inverse = ~points.known, points.inverse.copy()
     nuisances = np.array((rise_std, scale_std)) ** -2.0
     for _ in range(_ITERATIONS):
         off = np.append(state[:2] - mean[:2], wrap(state[2] - mean[2]))

@@ -13,9 +13,6 @@ from ngo_estimator.loops.picture_settings import PictureLoopConfig
 _WAYS_M = np.array((0.0, 0.15, 0.4, 0.8, 1.5, 2.5))
 """Lengths of the way that the fit may begin at."""
 
-_RANGED = 0.3
-"""A range is known where its deviation is less than this share of it."""
-
 _ANYWHERE = np.diag((4.0, 4.0, 1.0))
 """Covariance of one picture seen from the other before they were compared (m, m, rad)."""
 
@@ -63,7 +60,7 @@ def fit(
         return None
     (yaw, direction), agree = found
     points, seen = points[pairs[agree, 0]], seen[agree]
-    ranged = points.inverse_std < _RANGED * points.inverse
+    ranged = points.known
     if ranged.sum() < config.least_ranged:
         return None
     std_rad = np.full(len(seen), config.pixel_std * later.pixel_rad)

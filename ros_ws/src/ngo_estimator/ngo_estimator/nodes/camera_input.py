@@ -11,9 +11,10 @@ import numpy as np
 from rclpy.node import Node
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 from scipy.spatial.transform import Rotation
-from sensor_msgs.msg import CameraInfo, CompressedImage, Image
+from sensor_msgs.msg import CameraInfo, CompressedImage, Image, PointCloud2
 
 from ngo_common.nodes.process import StartError
+from ngo_common.nodes.qos import overridable
 from ngo_estimator.data.relative_step import RelativeStep
 from ngo_estimator.frontend.camera.calibrated_camera import NOT_MOUNTED, calibrated_camera
 from ngo_estimator.frontend.camera.picture_odometry import PictureOdometry
@@ -27,7 +28,7 @@ from ngo_recordings.images import COMPRESSED_TYPE, IMAGE_TYPE, picture
 from ngo_recordings.poses import Pose
 
 _MOUNTING_WAIT_NS = 2_000_000_000
-_MOST_HELD, _MOST_GIVEN = 64, 1000
+_MOST_HELD, _MOST_GIVEN, _DEPTH = 64, 1000, 10
 
 
 class CameraInput:
@@ -79,6 +80,9 @@ class CameraInput:
         for topic in self._info_topics:
             listening.to_all(CameraInfo, topic, partial(self._on_info, topic), pictures)
         self._robot.listen(listening, status)
+        self._points = self._node.create_publisher(
+            PointCloud2, settings.points_topic, _DEPTH, qos_overriding_options=overridable()
+        )
 
     def _on_info(self, topic: str, message: CameraInfo) -> None:
         arrays = (np.asarray(values, np.float64).tobytes() for values in (message.k, message.p, message.d))
@@ -141,6 +145,9 @@ class CameraInput:
         alone = self._core.by_wheels
         for step in self._core.ready():
             self._publish(step)
+            if self._points.get_subscription_count():
+                frame = self._settings.framed(self._settings.base_frame)
+                self._points.publish(messages.points_message(step.stamp_ns, self._core.points, frame))
         self._newly_alone += self._core.by_wheels - alone
         if unplaced := self._core.unplaced - self._unplaced:
             self._status.dropped("picture", f"no odometry at its stamp ({self._core.clocks})", unplaced)

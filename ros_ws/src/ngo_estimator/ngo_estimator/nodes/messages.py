@@ -18,6 +18,7 @@ from geometry_msgs.msg import (
 )
 from nav_msgs.msg import Odometry
 from ngo_msgs.msg import KeyScan, RelativePose, Trajectory
+from sensor_msgs.msg import PointCloud2, PointField
 from std_msgs.msg import Header
 from tf2_msgs.msg import TFMessage
 
@@ -145,6 +146,17 @@ def odometry_message(estimate: "RelativeStep", covariance: np.ndarray, odom_fram
     x, y, yaw = (estimate.relative_xyyaw / seconds).tolist()
     message.twist.twist = Twist(linear=Vector3(x=x, y=y), angular=Vector3(z=yaw))
     message.twist.covariance = to_spatial(estimate.covariance / seconds**2)
+    return message
+
+
+def points_message(stamp_ns: int, points: np.ndarray, frame: str) -> PointCloud2:
+    """A cloud of points ``(n, 3)``, m."""
+    message = PointCloud2(height=1, width=len(points), point_step=12, row_step=12 * len(points), is_dense=True)
+    message.header = Header(stamp=to_time(stamp_ns), frame_id=frame)
+    message.fields = [
+        PointField(name=name, offset=4 * axis, datatype=PointField.FLOAT32, count=1) for axis, name in enumerate("xyz")
+    ]
+    message.data = array("B", points.astype("<f4").tobytes())
     return message
 
 

@@ -143,6 +143,9 @@ class LocalNodeSettings(EstimatorSettings):
         "IMU whose yaw rate stands in for the turns of the robot's odometry, with world:=scan, where it agrees better "
         "with the scans.",
     )
+    points_topic: str = topic(
+        "points", "Points that the newest picture's corners show, in base_frame, with world:=camera, for who listens."
+    )
     image_reliability: str = setting(
         "best_effort",
         "Reliability of image_topic or scan_topic; reliable: lost messages are sent again.",

@@ -114,6 +114,11 @@ class PictureOdometry:
         return self._odometry.inliers
 
     @property
+    def points(self) -> np.ndarray:
+        """What corners show ``(n, 3)``, in base axes at the newest step."""
+        return self._odometry.points
+
+    @property
     def waiting(self) -> int:
         """Pictures that wait for odometry."""
         return len(self._waiting)

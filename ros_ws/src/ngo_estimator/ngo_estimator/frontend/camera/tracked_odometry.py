@@ -65,6 +65,13 @@ class TrackedOdometry:
         self._points = RangedRays(np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0), np.zeros(0))
         self._begin_step()
 
+    @property
+    def points(self) -> Array:
+        """What the corners show whose ranges are known ``(n, 3)``, in base axes at the newest frame."""
+        points = self._points[self._points.known]
+        seen = base_vectors(points, self.pose, self._centre_now) / points.inverse[:, None]
+        return seen + (*self._model.centre[:2], self._centre_now[2])
+
     def _begin_step(self) -> None:
         """Measure from the newest frame on."""
         self._centre = self._centre_now
