@@ -7,7 +7,9 @@ import pytest
 
 from ngo_estimator.data.relative_step import RelativeStep
 from ngo_estimator.frontend.camera.picture_odometry import PictureOdometry
+from ngo_estimator.frontend.camera.tracked_odometry import _likelier
 from ngo_estimator.geometry.planar_motion import between
+from ngo_estimator.geometry.view_pose import ViewPose
 from tests.unit.ngo_estimator.rendered_room import by_wheels, camera, drive, picture, rays_of
 
 PERIOD_NS = 100_000_000
@@ -88,3 +90,15 @@ def test_a_clock_that_is_wrong_is_told_by_the_stamps() -> None:
         assert not steps and odometry.unplaced == 100
         newest = f"{109.9:.3f} s" if ahead_s > 0.0 else "none"
         assert odometry.clocks == f"newest stamp of pictures {109.9 + ahead_s:.3f} s, of odometry {newest}"
+
+
+def test_a_texture_that_repeats_leaves_the_turn_as_open_as_the_wheels_do() -> None:
+    def view(yaw: float, agree: int) -> ViewPose:
+        return ViewPose(np.array((0.1, 0.0, yaw)), np.diag((1e-6, 1e-6, 1e-6)), np.arange(100) < agree)
+
+    given = np.diag((1e-2, 1e-2, 0.02**2))
+    assert _likelier(view(0.0, 40), view(0.07, 60), given).pose[2] == 0.0
+    assert _likelier(view(0.0, 10), view(0.07, 60), given).pose[2] == 0.07
+    for far_rad, least_rad, most_rad in ((0.07, 0.018, 0.0201), (0.01, 0.007, 0.008)):
+        covariance = _likelier(view(0.0, 40), view(far_rad, 60), given).covariance
+        assert least_rad < math.sqrt(covariance[2, 2]) < most_rad

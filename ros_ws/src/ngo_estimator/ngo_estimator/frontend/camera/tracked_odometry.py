@@ -37,6 +37,7 @@ _NEAREST = 1e-3
 _AGREEING = 0.5
 """Where fewer corners than this agree with the given motion, another one is looked for."""
 
+_FAR_MORE = 2.0
 _RANSAC_SAMPLES, _RANSAC_PX = 60, 2.0
 _MOST_SURPRISE = 4.0
 """Deviations of the given motion beyond which a fit is taken to have failed."""
@@ -158,8 +159,8 @@ class TrackedOdometry:
         fitted = fit(predicted, information)
         if fitted.inlier.mean() < _AGREEING:
             other = self._without_prior(seen, mean)
-            if other is not None and (again := fit(other, information)).inlier.sum() > 1.2 * fitted.inlier.sum():
-                fitted = again
+            if other is not None:
+                fitted = _likelier(fitted, fit(other, information), covariance)
         off = np.append(fitted.pose[:2] - mean[:2], wrap(fitted.pose[2] - mean[2]))
         if off[:2] @ information[:2, :2] @ off[:2] > _MOST_SURPRISE**2:
             # Few near points may tell any way: then the given one counts, and pictures tell the heading alone.
@@ -253,6 +254,20 @@ class TrackedOdometry:
 def _turn(yaw: float) -> Array:
     cos, sin = math.cos(yaw), math.sin(yaw)
     return np.array(((cos, -sin, 0.0), (sin, cos, 0.0), (0.0, 0.0, 1.0)))
+
+
+def _likelier(near: ViewPose, far: ViewPose, given: Array) -> ViewPose:
+    """Of two poses that corners may mean the one near the given motion, unless far more agree with the other.
+
+    Textures that repeat look the same again after a turn: what speaks for the other pose is left open, but for what the
+    covariance ``(3, 3)`` of the given motion excludes.
+    """
+    agree = int(near.inlier.sum()), int(far.inlier.sum())
+    if agree[1] > _FAR_MORE * agree[0]:
+        return far
+    off = np.append(far.pose[:2] - near.pose[:2], wrap(far.pose[2] - near.pose[2]))
+    covariance = near.covariance + agree[1] / max(1, sum(agree)) * np.outer(off, off)
+    return replace(near, covariance=_surer(covariance, given))
 
 
 def _surer(one: Array, other: Array) -> Array:
