@@ -163,6 +163,7 @@ def geometry(low: float, high: float, increment: float, rays: int) -> Any:
         (-90, 90, 0.5, 181, 1.0, None, "contradicts its ends"),
         (90, -90, -1.0, 181, -1.0, None, None),
         (90, -90, 1.0, 181, -1.0, None, "contradicts its ends"),
+        (180, -180, 1.0, 360, -1.0, None, "contradicts its ends"),
         (-90, 90, 0.0, 181, 1.0, None, "its ends count"),
         (-90, 90, math.nan, 181, 1.0, None, "its ends count"),
         (-90, 0.0, 1e-9, 181, 0.5, None, "its ends count"),
@@ -182,6 +183,14 @@ def test_angles_follow_the_rule(
     found = None if angles.likely_increment is None else math.degrees(angles.likely_increment)
     assert found == (None if likely is None else pytest.approx(likely))
     assert (note is None) == (angles.note is None) and (note or "") in (angles.note or "")
+
+
+def test_angles_in_degrees_are_taken_so() -> None:
+    message = scan(stamp(0), rays=181)
+    message.angle_min, message.angle_max, message.angle_increment = -90.0, 90.0, 1.0
+    angles = scan_angles(message)
+    assert (angles.angle_min, angles.angle_increment) == pytest.approx((-0.5 * math.pi, math.pi / 180.0))
+    assert angles.note is not None and "are in degrees" in angles.note
 
 
 @given(low=st.floats(), high=st.floats(), increment=st.floats(), rays=st.integers(0, 5))

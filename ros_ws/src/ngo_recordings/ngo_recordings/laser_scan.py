@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -16,6 +16,8 @@ _FULL_TURN = 2.0 * math.pi
 LEAST_INCREMENT = 1e-5
 # Rad; a scan of more than a turn with a wider one is no scan of a scanner that turns on.
 _WIDEST_INCREMENT = 0.1
+# Of degrees.
+_LARGEST_DEG = 720.0
 # Rays by which the ends of a scan may contradict its increment: some drivers count one ray more or less.
 _SLACK_RAYS = 1.5
 
@@ -93,13 +95,22 @@ def scan_angles(message: Any, topic: str = "the scan") -> ScanAngles:
     same direction a turn further on. Otherwise,
     and where it is 0 or no number, ``(angle_max - angle_min) / (n - 1)`` counts, if that is an increment. An increment
     that spreads n rays over a field of view as if they were n - 1 (180 rays over 180 deg: 1.0056 deg instead of 1 deg)
-    contradicts nothing; it counts and is noted. Of a scan of up to two turns the first turn counts.
+    contradicts nothing; it counts and is noted. Of a scan of up to two turns the first turn counts. Angles that only
+    degrees can be are degrees.
 
     Raises:
         RecordingError: neither gives angles within a full turn.
     """
     count = len(message.ranges)
     low, high, increment = float(message.angle_min), float(message.angle_max), float(message.angle_increment)
+    largest = max(abs(low), abs(high))
+    if not (2.0 * _FULL_TURN < largest <= _LARGEST_DEG and is_increment(math.radians(increment), count)):
+        return _angles(count, low, high, increment, topic)
+    found = _angles(count, math.radians(low), math.radians(high), math.radians(increment), topic)
+    return replace(found, note=f"angles of {topic} are in degrees, to {largest:g}: taken so")
+
+
+def _angles(count: int, low: float, high: float, increment: float, topic: str) -> ScanAngles:
     if not count or not math.isfinite(low) or abs(low) > 2.0 * _FULL_TURN:
         raise RecordingError(f"a scan of {topic} has {count} rays from {low:g} rad on; expected rays, and an angle")
     if _FULL_TURN < 0.99 * abs(increment) * (count - 1) <= 2.0 * _FULL_TURN and abs(increment) < _WIDEST_INCREMENT:
@@ -116,13 +127,14 @@ def scan_angles(message: Any, topic: str = "the scan") -> ScanAngles:
         note = f"the increment of {topic} is {increment:g} rad: its ends count, {math.degrees(implied):.4f} deg"
         return ScanAngles(low, implied, note)
     apart = abs(low + (count - 1) * increment - high)
-    given_deg, implied_deg = math.degrees(increment), math.degrees(implied)
+    given_deg = math.degrees(increment)
     turned = abs(implied + increment) <= _SLACK_RAYS * abs(increment) / count  # half a turn, told the other way round
     wraps = abs(apart - _FULL_TURN) <= _SLACK_RAYS * abs(increment) and not turned
     wraps &= abs(increment) * (count - 1) <= _FULL_TURN + _SLACK_RAYS * abs(increment)
     if count > 1 and apart > _SLACK_RAYS * abs(increment) and is_increment(implied, count) and not wraps:
-        note = f"the increment of {topic} is {given_deg:.4f} deg and contradicts its ends: {implied_deg:.4f} deg counts"
-        return ScanAngles(low, implied, note)
+        counts = -increment if turned else implied  # ends that are a ray off tell the side, and no more
+        note = f"the increment of {topic} is {given_deg:.4f} deg and contradicts its ends: {math.degrees(counts):.4f}"
+        return ScanAngles(low, counts, f"{note} deg counts")
     if not math.isfinite(high) or (count > 1 and apart > 0.5 * abs(increment)):
         note = f"angle_max of {topic} is {math.degrees(high):.2f} deg, not that of its last ray: the increment counts"
         return ScanAngles(low, increment, note)

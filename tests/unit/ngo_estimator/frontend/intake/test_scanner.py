@@ -77,14 +77,14 @@ def test_ranges_in_millimetres_are_told_and_scaled(limit_m: float, unit: float) 
 
 
 def test_ranges_far_away_and_codes_for_no_return_are_metres() -> None:
-    scanner = Scanner()
+    far, coded = Scanner(), Scanner()
     for scan in drive(10):
         code = np.full(RAYS, 65_535.0, np.float32)
         code[::12] = scan.ranges[::12]
-        for ranges in (code, 30.0 * scan.ranges):
+        for scanner, ranges in ((coded, code), (far, 30.0 * scan.ranges)):
             found = scanner.correct(replace(scan, ranges=ranges, range_max=0.0), 0.0)
             assert found is not None and np.array_equal(found.ranges, ranges)
-    assert not any("millimetres" in line for line in scanner.remarks("laser"))
+    assert not any("millimetres" in line for line in (*far.remarks("laser"), *coded.remarks("laser")))
 
 
 @pytest.mark.parametrize("late_ns", [1_000_000, 50_000_000])
@@ -155,6 +155,33 @@ def test_wheels_of_a_robot_that_stands_count() -> None:
         wheels.add(k * 10**9, np.zeros(3), WheelTruth())
         wheels.moved(np.array((0.004 * (-1) ** k, 0.0, 0.0)))  # a match is never exact
     assert not wheels.frozen and wheels.motion(10**9, 2 * 10**9) is not None
+
+
+@pytest.mark.parametrize("missing", [0, 7])
+def test_of_two_scanners_in_one_frame_the_first_counts(missing: int) -> None:
+    """The other one looks back; some of its scans are lost."""
+    scanner, scans, kept = Scanner(), drive(60), list[int]()
+    for k, scan in enumerate(scans):
+        back = replace(scan, stamp_ns=scan.stamp_ns + 20_000_000, ranges=np.roll(scan.ranges, RAYS // 2))
+        for each in (scan, back) if not missing or k % missing else (scan,):
+            if scanner.correct(each, 0.0) is not None:
+                kept.append(each.stamp_ns)
+    late = [stamp_ns for stamp_ns in kept if stamp_ns > scans[20].stamp_ns]
+    of_front = {scan.stamp_ns for scan in scans}
+    assert 35 <= len(late) <= 40 and of_front.issuperset(late)
+    assert "are of another scanner in the same frame" in scanner.remarks("laser")[0]
+
+
+def test_scans_of_one_scanner_all_count() -> None:
+    """Also where its rays change in number, where the robot turns fast, and where a turn comes in two halves."""
+    scanner, halves, half = Scanner(), Scanner(), RAYS // 2
+    for scan in drive(40):
+        for first in (0, half):
+            part = replace(scan, angle_min=scan.angles[first], ranges=scan.ranges[first : first + half])
+            assert halves.correct(part, 0.0) is not None
+    for k, scan in enumerate(drive(60)):
+        turned = replace(scan, ranges=np.roll(scan.ranges, 40 * k)[: RAYS - k % 2])
+        assert scanner.correct(turned, 0.0) is not None
 
 
 def poses_of(offset: Array, count: int, begin: int = 0) -> list[WheelPose]:

@@ -57,7 +57,7 @@ class LidarIntake:
         self._single_wheels = SingleWheels()
         self._mountings: dict[str, Mounting | None] = {}
         for scanner in self._scanners.values():
-            scanner.sweep.interrupt()
+            scanner.interrupt()
         self._imu.interrupt()
         self._wheels = CorrectedWheels(self._imu)
         self._waiting_wheels: deque[WheelPose] = deque()

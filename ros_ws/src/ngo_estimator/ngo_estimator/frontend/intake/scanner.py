@@ -6,6 +6,7 @@ from ngo_estimator.frontend.intake.no_return import NoReturnValues
 from ngo_estimator.frontend.intake.own_returns import OwnReturns
 from ngo_estimator.frontend.intake.range_unit import RangeUnit
 from ngo_estimator.frontend.intake.repeated_scans import RepeatedScans
+from ngo_estimator.frontend.intake.single_scanner import SingleScanner
 from ngo_estimator.frontend.intake.sweep import MeasuredSweep
 from ngo_estimator.geometry.planar_motion import Array
 from ngo_recordings.scan_stream import LidarScan
@@ -18,13 +19,15 @@ class Scanner:
         self.sweep = MeasuredSweep()
         """How long it sweeps and which way."""
         self._repeated = RepeatedScans()
+        self._single = SingleScanner()
         self._unit = RangeUnit()
         self._no_return = NoReturnValues()
         self._own = OwnReturns()
 
     def correct(self, scan: LidarScan, min_range_m: float) -> LidarScan | None:
-        """The scan as it should be, without ranges below ``min_range_m``; None where it is the last one again."""
-        if self._repeated.repeats(scan):
+        """The scan as it should be, without ranges below ``min_range_m``; None where it is the last one again,
+        or of another scanner."""
+        if self._repeated.repeats(scan) or not self._single.counts(scan):
             return None
         scan = self._unit.metres(scan)
         if scan.range_min < min_range_m:
@@ -34,6 +37,11 @@ class Scanner:
         if ranges is not scan.ranges:
             scan = replace(scan, ranges=ranges)
         return self.sweep.correct(scan)
+
+    def interrupt(self) -> None:
+        """What comes is not compared with what came; what was learned stays."""
+        self.sweep.interrupt()
+        self._single.interrupt()
 
     def moved(self, step: Array) -> None:
         """Take the robot's motion ``(3,)`` since the scan before."""
@@ -46,7 +54,7 @@ class Scanner:
         if self._no_return.values:
             values = ", ".join(f"{value:g}" for value in self._no_return.values)
             lines.append(f"{name} says {values} m where nothing came back: taken so")
-        told = self._unit.remark(), self._repeated.remark(), self.sweep.remark()
+        told = self._unit.remark(), self._repeated.remark(), self._single.remark(), self.sweep.remark()
         lines += [f"{name}: {line}" for line in told if line]
         if self._own.rays:
             lines.append(f"{self._own.rays} rays of {name} see the robot itself: left out")
