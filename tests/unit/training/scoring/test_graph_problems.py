@@ -44,6 +44,13 @@ def test_wrong_loops_near_each_other_do_not_pass_for_right_ones_with_large_varia
     assert 25.0 < scale < 100.0
 
 
+def test_places_are_believed_against_a_chain_that_is_ten_times_worse_than_stated() -> None:
+    """Cycles with such a chain rule out right places, and what they let in makes a solution that seems to agree."""
+    judged = synthetic("random", 60.0, 500, False, 0, hard=True)
+    problem = replace(judged.problem, steps=judged.problem.steps.scaled(0.01))
+    assert judged.ate_m(Robust().correct(problem).poses) < 0.5
+
+
 def test_the_error_is_that_after_the_best_alignment() -> None:
     judged = synthetic("random", 30.0, 200, True, 1)
     true = np.column_stack((judged.truth, np.zeros(200)))

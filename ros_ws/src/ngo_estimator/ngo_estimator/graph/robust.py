@@ -44,8 +44,9 @@ _MOST_FILLED = 2_000_000
 _FEWER = 0.7
 """How many loops are tried where those before are too many."""
 
-_RULED_OUT = 0.2
-"""Where cycles of places rule out so many of the loops that fit in the end, the chain is worse than stated."""
+_AGREE = 0.9
+"""So many of the places that cycles let in or a solution believes are both. Otherwise the chain may be worse than
+stated: then all loops are tried, too."""
 
 _LEAST_REDUNDANCY = 30.0
 """Degrees of freedom from which on residuals measure a scale."""
@@ -112,8 +113,8 @@ def _from_nothing(problem: GraphProblem, told: Told, least_scale: float) -> Corr
     different = {scaled.fits(poses).tobytes(): poses for poses in solutions}  # what believes the same ends at the same
     solutions += [_looked_again(scaled, poses, area, inlier_ratio, told) for poses in different.values()]
     best = min(solutions, key=lambda poses: truncated_cost(scaled, poses))
-    believed = scaled.fits(best) & ~metric
-    if not metric.all() and (odds[believed] <= 0.0).sum() >= _RULED_OUT * believed.sum():
+    fits, let_in = scaled.fits(best)[~metric], odds[~metric] > 0.0
+    if not metric.all() and (fits & let_in).sum() <= _AGREE * (fits | let_in).sum():
         everything, structure = _affordable(begun, rows)
         poses = graduate(everything, chain, told=told, structure=structure)[0]
         best = min(best, poses, key=lambda poses: truncated_cost(scaled, poses))
