@@ -50,18 +50,22 @@ def test_a_value_that_means_no_return_may_jitter(jitter_m: float, beyond: bool) 
 
 
 def test_what_stands_in_the_room_is_no_value_of_no_return() -> None:
-    """Also where the robot turns beside it on the spot, and where it drives past."""
-    found, turning = NoReturnValues(), NoReturnValues()
+    """Also where the robot turns beside it on the spot, where it drives past, and where it sees itself."""
+    found, turning, itself = NoReturnValues(), NoReturnValues(), NoReturnValues()
     for k, scan in enumerate(drive()):
         ranges = scan.ranges.copy()
-        ranges[np.arange(20) + 5 * k] = 0.7 + 0.001 * np.arange(20)
+        ranges[np.arange(20) + 5 * k] = 1.2 + 0.001 * np.arange(20)
         turning.clean(replace(scan, ranges=ranges))
         turning.moved(np.array((0.0, 0.0, 0.1)))
-        beside = math.hypot(0.7, 0.1 * (k - 30))
+        beside = math.hypot(1.2, 0.1 * (k - 30))
         ranges[np.arange(20) + 5 * k] = beside + 0.001 * np.arange(20)
         found.clean(replace(scan, ranges=ranges))
         found.moved(STEP)
-    assert found.values == [] and turning.values == []
+        ranges = scan.ranges.copy()
+        ranges[:20] = 0.4 + 0.001 * np.arange(20)
+        itself.clean(replace(scan, ranges=ranges))
+        itself.moved(STEP)
+    assert found.values == [] and turning.values == [] and itself.values == []
 
 
 @pytest.mark.parametrize(("limit_m", "unit"), [(30.0, 1.0), (30_000.0, 0.001), (0.0, 1.0)])

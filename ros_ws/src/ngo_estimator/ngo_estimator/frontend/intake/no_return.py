@@ -27,6 +27,9 @@ _LEAST_GAP = 0.25
 _JITTER_M = 0.04
 """From the least to the largest range of a value that jitters."""
 
+_JITTERS_FROM_M = 1.0
+"""Nearer, the robot itself has the same range from all places."""
+
 _SHARE = 0.01
 _TOP_SHARE = 0.03
 """Of the ranges; of an exact value that is the largest of its scan a few scans suffice."""
@@ -97,7 +100,7 @@ class NoReturnValues:
         if math.hypot(*(self._pose - self._counted)[:2]) < _APART_M:
             return
         self._counted = self._pose
-        self._jittered.append(_piled(ranges, max(scan.range_min, 0.0), largest, _JITTER_M)[0].tolist())
+        self._jittered.append(_piled(ranges, max(scan.range_min, _JITTERS_FROM_M), largest, _JITTER_M)[0].tolist())
         for value in self._jittered[-1]:
             near = [other for values in self._jittered for other in values if abs(other - value) < 0.5 * _JITTER_M]
             if len(near) >= _SCANS:
