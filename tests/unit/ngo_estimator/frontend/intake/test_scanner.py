@@ -207,3 +207,6 @@ def test_an_odometry_that_begins_anew_goes_on() -> None:
     single, before, after = SingleWheels(), poses_of(np.zeros(3), 10), poses_of(np.array((5.0, 3.0, 1.0)), 10, begin=10)
     assert [kept for each in (*before, *after) for kept in single.add(each)] == [*before, *after]
     assert single.remark() == ""
+    millimetres = [replace(each, pose_xyyaw=each.pose_xyyaw * (1000.0, 1000.0, 1.0)) for each in before]
+    single = SingleWheels()
+    assert [kept for each in millimetres for kept in single.add(each)] == millimetres[:-1], "the last one waits"

@@ -24,24 +24,34 @@ class SingleWheels:
         self.left_out = 0
         """How many poses are of another odometry."""
         self._last: WheelPose | None = None
+        self._held: WheelPose | None = None
         self._other: WheelPose | None = None
-        self._beside = False  # whether the last one went on since the other was heard
 
     def add(self, wheels: WheelPose) -> list[WheelPose]:
         """Take a pose; returns those that are to be used by now."""
-        last, other = self._last, self._other
-        if last is None or not abs(wheels.stamp_ns - last.stamp_ns) < _SILENT_NS or _goes_on(last, wheels):
-            self._last, self._beside = wheels, True
+        held, self._held = self._held, None
+        if self._last is None or not _is_soon(self._last, wheels):
+            self._last = wheels
+            return [wheels] if held is None else [held, wheels]
+        if _goes_on(self._last, wheels):
+            if held is not None:
+                self._other = held
+                self.left_out += 1
+            self._last = wheels
             return [wheels]
-        self._other = wheels
-        if other is None or not _goes_on(other, wheels):
-            self._beside = False
-            return []
-        if self._beside:
+        if self._other is not None and _is_soon(self._other, wheels) and _goes_on(self._other, wheels):
+            self._held, self._other = held, wheels
             self.left_out += 1
             return []
-        self._last, self._other = wheels, None
-        return [other, wheels]
+        if held is None:
+            self._held = wheels
+            return []
+        self._last = held  # it began anew there, or moves as no robot does
+        if _goes_on(held, wheels):
+            self._last = wheels
+            return [held, wheels]
+        self._held = wheels
+        return [held]
 
     def remark(self) -> str:
         """In words; nothing where there is one odometry."""
@@ -56,6 +66,10 @@ def is_possible(step: Array, elapsed_s: float) -> bool:
     """Whether a robot moves by a step ``(3,)`` within a time."""
     way, turn = math.hypot(step[0], step[1]), abs(math.remainder(step[2], math.tau))
     return way <= _FASTEST[0] * elapsed_s + _AT_ONCE[0] and turn <= _FASTEST[1] * elapsed_s + _AT_ONCE[1]
+
+
+def _is_soon(before: WheelPose, after: WheelPose) -> bool:
+    return abs(after.stamp_ns - before.stamp_ns) < _SILENT_NS
 
 
 def _goes_on(before: WheelPose, after: WheelPose) -> bool:
