@@ -77,4 +77,8 @@ def _short(row: dict[str, Any] | None) -> str:
 def _over_cells(cells: dict[str, Any], rows: list[str]) -> str:
     """Mean share solved of each row over the cells where it was measured."""
     means = {row: [cell[row]["solved"]["mean"] for cell in cells.values() if row in cell] for row in rows}
-    return "Mean over cells: " + ", ".join(f"{row} {np.mean(values):.2f}" for row, values in means.items()) + "."
+    said = (
+        f"{row} {np.mean(values):.2f}" + (f" ({len(values)} of {len(cells)} cells)" if len(values) < len(cells) else "")
+        for row, values in means.items()
+    )
+    return f"Mean over cells: {', '.join(said)}."
