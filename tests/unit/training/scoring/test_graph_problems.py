@@ -9,7 +9,7 @@ import pytest
 
 from ngo_estimator.geometry.se2 import between, compose
 from ngo_estimator.graph.corrector import GraphProblem
-from ngo_estimator.graph.cycle_agreement import ChainUncertainty
+from ngo_estimator.graph.cycle_agreement import ChainUncertainty, chain_poses
 from ngo_estimator.graph.loop_evidence import map_area, scale_and_inlier_ratio
 from ngo_estimator.graph.robust import Robust
 from training import results_graphs
@@ -42,6 +42,18 @@ def test_wrong_loops_near_each_other_do_not_pass_for_right_ones_with_large_varia
     assert 0.5 < scale < 2.0 and inlier_ratio < 0.4
     scale, _ = scale_and_inlier_ratio(ChainUncertainty(problem.steps.scaled(0.02)), problem.loops.scaled(0.02), area)
     assert 25.0 < scale < 100.0
+
+
+@pytest.mark.parametrize("span", [1, 2])
+def test_a_few_loops_that_repeat_the_odometry_do_not_rule_out_all_others(span: int) -> None:
+    """Their residuals are zero, as where a graph says steps twice or composes two of them to one edge."""
+    judged = synthetic("random", 30.0, 300, True, 0)
+    problem, first = judged.problem, np.arange(0, 290, 13)
+    nodes = np.stack((first, first + span), axis=1)
+    relative = between(*(chain_poses(problem.steps.relative)[each] for each in nodes.T))
+    loops = problem.loops.extended(replace(problem.steps[first], nodes=nodes, relative=relative))
+    solution = Robust().correct(replace(problem, loops=loops, trust=np.ones(len(loops))))
+    assert (solution.loop_weights[: len(problem.loops)] > 0.0)[judged.right].mean() > 0.9
 
 
 def test_places_are_believed_against_a_chain_that_is_ten_times_worse_than_stated() -> None:

@@ -24,7 +24,7 @@ _MOST_SUPPORT = 7.0
 _SCALES = np.exp(np.linspace(math.log(1e-3), math.log(1e3), 61))
 _SMALL, _OFTEN = 0.115, 0.05
 """One right loop in a hundred is off by less than the first (squared, in variances of three degrees of freedom). Where
-so large a share of all is, variances are smaller."""
+so large a share of all is, variances are no larger than stated: these may be loops that repeat the odometry."""
 
 _ROUNDS = 12  # of expectation and maximisation, for the inlier ratio
 _TOLD = 0.1  # log odds that a chain's prediction has at least where it comes true
@@ -65,7 +65,7 @@ def scale_and_inlier_ratio(chain: ChainUncertainty, loops: RelativePoses, area: 
         return 1.0, 0.5
     best = (-math.inf, 1.0, 0.5)
     # Wrong loops near each other along the chain look like right ones whose variances are large.
-    largest = max(float(np.quantile(squared, _OFTEN)) / _SMALL, _SCALES[0])
+    largest = max(float(np.quantile(squared, _OFTEN)) / _SMALL, 1.0)
     for scale in _SCALES[largest >= _SCALES].tolist():
         ratio = np.clip(likelihood_ratio(squared, logs, degrees, area, scale), -_LARGEST, _LARGEST)
         inlier_ratio = 0.5
