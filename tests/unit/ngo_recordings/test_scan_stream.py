@@ -2,6 +2,7 @@
 
 import math
 from collections import Counter
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -259,18 +260,29 @@ def test_a_scanner_that_hangs_upside_down_is_seen(tmp_path: Path, yaw: float) ->
     np.testing.assert_allclose(found.base_from_scan_xyyaw, [0.2, 0.0, yaw], atol=1e-9)
 
 
+def mounting_of_drives(tmp_path: Path, *drives: tuple[int, int, Mapping[int, float]]) -> Any:
+    """Of files, each with its start (ns), its count of scans, and when the scanner is said to sit where (x, m)."""
+    paths = []
+    for start_ns, scans, said in drives:
+        entries = [(name, at + start_ns, message) for name, at, message in drive(scans)]
+        for at, x in said.items():
+            entries.append(("/tf_static", at, m.transforms(static("base_link", "laser", x, 0.0, 0.0))))
+        paths.append(m.write_mcap(tmp_path / f"{len(paths)}.mcap", sorted(entries, key=lambda entry: entry[1])))
+    with open_recording(paths) as recording:
+        return find_mounting(recording, WITH_WHEELS)
+
+
 def test_of_a_mounting_that_changes_the_one_that_holds_longest_counts(tmp_path: Path) -> None:
-    entries = drive(20)
-    for at, x in ((1, 5.0), (stamp(0.0), 0.3), (stamp(15.0), 0.9), (stamp(18.0), 0.3)):
-        entries.append(("/tf_static", at, m.transforms(static("base_link", "laser", x, 0.0, 0.0))))
-    with open_recording([m.write_mcap(tmp_path / "a.mcap", sorted(entries, key=lambda entry: entry[1]))]) as recording:
-        found = find_mounting(recording, WITH_WHEELS)
-    assert found is not None and found.base_from_scan_xyyaw[0] == pytest.approx(5.0)
-    entries = [entry for entry in entries if entry[1] > 1]
-    with open_recording([m.write_mcap(tmp_path / "b.mcap", sorted(entries, key=lambda entry: entry[1]))]) as recording:
-        found = find_mounting(recording, WITH_WHEELS)
-    assert found is not None and found.base_from_scan_xyyaw[0] == pytest.approx(0.3)
-    assert "it changes on the way" in str(found)
+    found = mounting_of_drives(tmp_path, (0, 20, {stamp(0): 0.3, stamp(15): 0.9, stamp(18): 0.3}))
+    assert found.base_from_scan_xyyaw[0] == pytest.approx(0.3) and "it changes on the way" in str(found)
+
+
+def test_time_without_scans_speaks_for_no_mounting(tmp_path: Path) -> None:
+    found = mounting_of_drives(tmp_path, (0, 20, {1: 5.0, stamp(-10): 0.3}))
+    assert found.base_from_scan_xyyaw[0] == pytest.approx(0.3)
+    pause_ns = 3600 * S
+    found = mounting_of_drives(tmp_path, (0, 3, {stamp(-1): 5.0}), (pause_ns, 20, {stamp(-1) + pause_ns: 0.3}))
+    assert found.base_from_scan_xyyaw[0] == pytest.approx(0.3)
 
 
 def test_a_tilt_is_stated(tmp_path: Path) -> None:

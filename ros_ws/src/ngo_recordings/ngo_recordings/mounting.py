@@ -87,11 +87,11 @@ def find_pose(
 ) -> tuple[str, str, Pose, str] | None:
     """The robot's frame, that of a sensor (None: of topics.image), the sensor's pose there, and which topics say it.
 
-    Chains of transforms are composed. Those of /tf_static count, of a frame whose transform changes the one that holds
-    longest; where they do not join the two frames, the first
-    transforms of /tf (10 min of it) are taken, without those that move the robot itself. The robot's frame is the child
-    of the wheel odometry, else base_link, base_footprint or base, with the robot's prefix where it has one. Topics of
-    transforms in another robot's namespace are left out. None where no transform says it.
+    Chains of transforms are composed. Those of /tf_static count; where a frame's transform changes, the one that holds
+    longest while topics.image is recorded. Where they do not join the two frames, the first transforms of /tf (10 min
+    of it) are taken, without those that move the robot itself. The robot's frame is the child of the wheel odometry,
+    else base_link, base_footprint or base, with the robot's prefix where it has one. Topics of transforms in another
+    robot's namespace are left out. None where no transform says it.
 
     Raises:
         RecordingError: a message that cannot be read.
@@ -101,7 +101,7 @@ def find_pose(
     tree = TransformBuffer()
     names = transform_topics(recording, topics.image)
     static = [name for name in names if name.endswith("static")]
-    held, changed = _held_longest(recording, static, recording.topics[topics.image].last_ns)
+    held, changed = _held_longest(recording, static, topics.image)
     tree.take(held, static=True)
     if (found := _lookup(tree, bases, scan_frame)) is not None:
         source = ", ".join(static)
@@ -154,19 +154,21 @@ def _transforms(recording: Recording, names: list[str]) -> Iterator[tuple[int, A
             yield message.log_time_ns, each
 
 
-def _held_longest(recording: Recording, names: list[str], end_ns: int) -> tuple[list[Any], set[str]]:
-    """Of each frame the static transform that holds for the longest time, and the frames of which there are several."""
+def _held_longest(recording: Recording, names: list[str], sensor: str) -> tuple[list[Any], set[str]]:
+    """Of each frame the static transform that holds longest while a sensor's topic is recorded, and which change."""
+    spans_ns = recording.spans_ns(sensor)
     said: dict[str, list[tuple[int, Any]]] = {}
     for log_time_ns, each in _transforms(recording, names):
         said.setdefault(each.child_frame_id.strip("/"), []).append((log_time_ns, each))
     held, changed = [], set()
     for child, all_said in said.items():
-        times_ns = [time_ns for time_ns, _ in all_said]
+        starts_ns = [0, *(time_ns for time_ns, _ in all_said[1:])]  # what is said first also held before
         total: dict[str, int] = {}
         last: dict[str, Any] = {}
-        for (time_ns, each), until_ns in zip(all_said, [*times_ns[1:], max(end_ns, times_ns[-1] + 1)], strict=True):
+        for (_, each), from_ns, until_ns in zip(all_said, starts_ns, [*starts_ns[1:], 2**63], strict=True):
             value = f"{each.header.frame_id} {each.transform}"
-            total[value] = total.get(value, 0) + until_ns - time_ns
+            held_ns = sum(max(0, min(until_ns, last + 1) - max(from_ns, first)) for first, last in spans_ns)
+            total[value] = total.get(value, 0) + held_ns
             last[value] = each
         held.append(last[max(total, key=lambda value: total[value])])
         if len(total) > 1:

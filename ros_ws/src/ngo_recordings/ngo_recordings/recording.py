@@ -93,6 +93,11 @@ class Recording:
         for source, _ in self._sources:
             source.close()
 
+    def spans_ns(self, name: str) -> list[tuple[int, int]]:
+        """Log times of a topic's first and last message in each file that has any."""
+        stored = [source.topics[name] for source, _ in self._sources if name in source.topics]
+        return [(part.first_ns, part.last_ns) for part in stored if part.count]
+
     def messages(self, names: Collection[str] | None = None) -> Iterator[Message]:
         """Every message of these topics (None: of all) in order of log time, read as they are asked for.
 
