@@ -64,6 +64,24 @@ def test_a_ray_that_goes_on_below_the_floor_met_none() -> None:
     assert ramp.without(far, Mounting(np.zeros(3))) is far, "its height is not known"
 
 
+@pytest.mark.filterwarnings("error")
+def test_rays_without_a_return_stay_so() -> None:
+    floor_rays = FloorRays()
+    for stamp_ns in (10**9, 2 * 10**9):
+        floor_rays.add(stamp_ns, up_of(0.0))
+    level, _ = scan(np.array((2.0, 2.0, 0.2)), up_of(0.0), 2 * 10**9)
+    level.ranges[::3], level.ranges[1::3] = np.inf, np.nan
+    assert floor_rays.without(level, MOUNTING) is level
+
+
+def test_a_doubled_stamp_of_an_imu_loses_nothing() -> None:
+    floor_rays, up = FloorRays(), up_of(math.radians(4.0))
+    for stamp_ns, at in ((10**9, up_of(0.0)), (2 * 10**9, up), (21 * 10**8, up), (21 * 10**8, up)):
+        floor_rays.add(stamp_ns, at)
+    tilted, _ = scan(np.array((2.0, 2.0, 0.2)), up, 2 * 10**9)
+    assert np.isnan(floor_rays.without(tilted, MOUNTING).ranges).any()
+
+
 def test_a_robot_that_brakes_and_tilts_knows_its_way_by_an_imu() -> None:
     noise, pose, poses, records = np.random.default_rng(0), np.array((1.0, 1.0, 0.2)), [], list[LidarRecord]()
     for k in range(60):

@@ -1,7 +1,8 @@
 """Rays that meet the floor while the robot brakes, tilts or stands on a ramp, by an IMU that knows where up is.
 
 A ray is left out where its end lies at the height of the floor below the tilted scanner. What ends higher is a wall,
-and where a ray goes on below, the floor is not there: so a wrong tilt costs a few ends of rays, and no more.
+and where a ray goes on below, the floor is not there. Walls that a wrong tilt puts at the height of the floor are left
+out, too. Their ranges alone do not tell them from a floor.
 """
 
 import math
@@ -42,8 +43,10 @@ class FloorRays:
         self._level: Array | None = None
 
     def add(self, stamp_ns: int, up: Array) -> None:
-        """Take the world's up in the robot's axes ``(3,)``; one that is not newer than the last begins anew."""
-        if self._stamps and stamp_ns <= self._stamps[-1]:
+        """Take the world's up in the robot's axes ``(3,)``; an older stamp than the last begins anew."""
+        if self._stamps and stamp_ns == self._stamps[-1]:
+            return
+        if self._stamps and stamp_ns < self._stamps[-1]:
             self._stamps.clear()
             self._slopes.clear()
         elapsed_s = (stamp_ns - self._stamps[-1]) * 1e-9 if self._stamps else 0.0
@@ -62,9 +65,9 @@ class FloorRays:
         angles = mounting.sensor_xyyaw[2] + (-scan.angles if mounting.upside_down else scan.angles)
         ahead, left = (np.interp(scan.ray_offsets_s, times_s, slopes[:, axis]) for axis in (0, 1))
         down = -(ahead * np.cos(angles) + left * np.sin(angles))  # metres per metre
-        height = mounting.height_m - down * scan.ranges
-        unsure = _LEAST * scan.ranges
-        with np.errstate(invalid="ignore"):
+        with np.errstate(invalid="ignore"):  # infinite ranges
+            height = mounting.height_m - down * scan.ranges
+            unsure = _LEAST * scan.ranges
             floor = (down > _LEAST) & (height < _ABOVE_M + unsure) & (height > -_BELOW_M - unsure)
         if not floor.any():
             return scan
