@@ -264,13 +264,16 @@ def test_of_a_folder_that_was_copied_in_part_the_rest_is_read(tmp_path: Path) ->
         assert "/image" in recording.topics and "lacks drive_1.mcap" in recording.notes[0]
 
 
-@pytest.mark.parametrize("name", ["drive", "drive.bag", "drive.MCAP", "drive.mcap.zst"])
-def test_what_a_file_begins_with_counts_before_its_name(tmp_path: Path, name: str) -> None:
-    path = m.write_mcap(tmp_path / "a.mcap", drive())
-    content = path.read_bytes()
-    (tmp_path / name).write_bytes(zstandard.ZstdCompressor().compress(content) if name.endswith("zst") else content)
-    with open_recording([tmp_path / name]) as recording, open_recording([path]) as expected:
-        assert recording.topics == expected.topics
+@pytest.mark.parametrize("kind", ["mcap", "db3"])
+def test_what_a_file_begins_with_counts_before_its_name(tmp_path: Path, kind: str) -> None:
+    folder = m.write_rosbag(tmp_path / "db3", drive()) if kind == "db3" else m.write_mcap(tmp_path / "mcap", drive())
+    content = next(folder.glob(f"*.{kind}")).read_bytes()
+    packed = zstandard.ZstdCompressor().compress(content)
+    for name in ("drive", "drive.bag", "drive.MCAP", "drive.DB3", "drive.db", "drive.sqlite"):
+        for path, data in ((tmp_path / name, content), (tmp_path / f"{name}.zst", packed), (tmp_path / name, packed)):
+            path.write_bytes(data)
+            with open_recording([path]) as recording:
+                assert facts(recording.messages()) == expected(list(drive())), path
 
 
 def test_topics_that_are_not_there_or_of_two_types_are_named(tmp_path: Path) -> None:

@@ -15,7 +15,8 @@ from ngo_recordings.errors import RecordingError
 from ngo_recordings.mcap_file import McapFile
 from ngo_recordings.rosbag_folder import RosbagFolder
 
-PACKED = ".zstd"
+PACKED = "packed"
+_PACKED_NAMES = (".db3.zstd", ".mcap.zstd", ".db3.zst", ".mcap.zst")
 
 _MAGIC = {
     ".mcap": b"\x89MCAP",
@@ -37,7 +38,7 @@ class CopiedFile:
         copy = Path(self._folder.name, name)
         try:
             fill(copy)
-            self._file = McapFile(copy, max_chunk_bytes) if copy.suffix == ".mcap" else RosbagFolder(copy)
+            self._file = McapFile(copy, max_chunk_bytes) if kind_of(copy) == ".mcap" else RosbagFolder(copy)
         except (OSError, sqlite3.Error, zstandard.ZstdError, RecordingError) as error:
             self._folder.cleanup()
             reason = " ".join(str(error).replace(str(copy), str(path)).split())
@@ -68,17 +69,19 @@ def packed_file(path: Path, max_chunk_bytes: int) -> CopiedFile:
 
 
 def kind_of(path: Path) -> str:
-    """The kind of a file as the ending of its name, by what it begins with; else by its name, in small letters."""
+    """The kind of a file, by what it begins with, else by its name: ".mcap", ".db3", ".bag", PACKED, or its ending."""
     try:
         with path.open("rb") as file:
             begin = file.read(16)
     except OSError:
         begin = b""
-    found = next((kind for kind, magic in _MAGIC.items() if begin.startswith(magic)), None)
+    return next((kind for kind, magic in _MAGIC.items() if begin.startswith(magic)), named_kind(path))
+
+
+def named_kind(path: Path) -> str:
+    """The kind of a file by its name, in capitals or small letters."""
     name = path.name.lower()
-    if found is None and name.endswith((".db3.zstd", ".mcap.zstd", ".db3.zst", ".mcap.zst")):
-        return PACKED
-    return found or Path(name).suffix
+    return PACKED if name.endswith(_PACKED_NAMES) else Path(name).suffix
 
 
 def log_of(path: Path) -> Path:

@@ -21,7 +21,7 @@ _ENCODINGS = {
 
 
 class RosbagFolder:
-    """What the rosbags library reads: sqlite3 files, and folders of sqlite3 or compressed mcap files.
+    """What the rosbags library reads: sqlite3 files of any name, and folders of sqlite3 or compressed mcap files.
 
     Raises RecordingError where it cannot.
     """
@@ -34,7 +34,7 @@ class RosbagFolder:
         self.path = path
         self.topics: dict[str, Stored] = {}
         try:
-            self._reader = Reader(path)
+            self._reader = Reader.STORAGE_PLUGINS["dir" if path.is_dir() else ".db3"](path)
             self._reader.open()
             for connection in self._reader.connections:
                 self._add(connection)
@@ -69,7 +69,7 @@ class RosbagFolder:
 
     def _last_ns(self, connection: Connection, first_ns: int) -> int:
         """Log time of a topic's last message: looks for it in ever longer parts of the end."""
-        end_ns, span_ns = self._reader.end_time, 10**9
+        end_ns, span_ns = self._reader.metadata.end_time, 10**9
         while True:
             start_ns = max(first_ns, end_ns - span_ns)
             times = [log_time_ns for _, log_time_ns, _ in self._reader.messages([connection], start=start_ns)]
