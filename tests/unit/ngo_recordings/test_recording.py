@@ -264,6 +264,33 @@ def test_of_a_folder_that_was_copied_in_part_the_rest_is_read(tmp_path: Path) ->
         assert "/image" in recording.topics and "lacks drive_1.mcap" in recording.notes[0]
 
 
+def test_in_a_folder_names_say_which_files_are_recordings(tmp_path: Path) -> None:
+    """What only begins as a recording, or is not named by a metadata.yaml that can be read, lies there by chance."""
+    folder = m.write_rosbag(tmp_path / "bag", drive())
+    (folder / "metadata.yaml").unlink()
+    with sqlite3.connect(folder / "rtabmap.db") as database:
+        database.execute("CREATE TABLE Node(id)")
+    database.close()
+    (folder / "notes.txt.zst").write_bytes(zstandard.ZstdCompressor().compress(b"notes"))
+    (folder / "empty.db3.zst").touch()
+    cut = m.write_mcap(tmp_path / "drive", drive())
+    metadata = cut / "metadata.yaml"
+    metadata.write_text(metadata.read_text().replace("- drive_0.mcap", "- drive_0.mcap\n  - drive_1.mcap"))
+    for name in ("drive_0.mcap.bak", "old.mcap"):
+        shutil.copy(cut / "drive_0.mcap", cut / name)
+    for opened, note in ((folder, "empty.db3.zst in "), (cut, f"{cut} lacks drive_1.mcap")):
+        with open_recording([opened]) as recording:
+            assert facts(recording.messages()) == expected(list(drive()))
+            assert len(recording.notes) == 1 and recording.notes[0].startswith(note)
+    metadata.unlink()
+    (cut / "old.mcap").unlink()
+    with open_recording([cut]) as recording:
+        assert facts(recording.messages()) == expected(list(drive()))
+    (cut / "drive_0.mcap").unlink()
+    with open_recording([cut]) as recording:  # of a name that says nothing
+        assert facts(recording.messages()) == expected(list(drive()))
+
+
 @pytest.mark.parametrize("kind", ["mcap", "db3"])
 def test_what_a_file_begins_with_counts_before_its_name(tmp_path: Path, kind: str) -> None:
     folder = m.write_rosbag(tmp_path / "db3", drive()) if kind == "db3" else m.write_mcap(tmp_path / "mcap", drive())

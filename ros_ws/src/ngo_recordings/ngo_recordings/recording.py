@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import heapq
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,7 +14,7 @@ import yaml
 
 from ngo_recordings.bounds import MAX_CHUNK_BYTES, check_regular, unpacked
 from ngo_recordings.carmen_log import CarmenLog
-from ngo_recordings.copied_file import PACKED, CopiedFile, database_with_log, has_log, kind_of, packed_file
+from ngo_recordings.copied_file import PACKED, CopiedFile, database_with_log, has_log, kind_of, named_kind, packed_file
 from ngo_recordings.decoding import Decoder
 from ngo_recordings.errors import RecordingError
 from ngo_recordings.mcap_file import McapFile
@@ -28,7 +28,7 @@ _PACKED_MESSAGE = b"\x28\xb5\x2f\xfd"  # begins no message in CDR
 _CARMEN = (".log", ".clf", ".log.gz", ".clf.gz")
 _IN_FOLDERS = (".mcap", ".db3", PACKED)
 _EMPTY = "has nothing in it: left out"
-_OTHERS = "is not read: it is of another kind than the first file"
+_OTHERS = "is not read: in a folder .mcap files count before .db3 files, and these before packed ones"
 _KINDS = "a .mcap, .db3 or .bag file, a CARMEN log (.log, .clf, either with .gz), or the folder of a rosbag2"
 
 
@@ -189,7 +189,7 @@ def _open_folder(path: Path, max_chunk_bytes: int, notes: list[str]) -> Iterator
     """A folder whose recorder was killed has no metadata.yaml, or a cut one: its files are taken as they are."""
     metadata = path / "metadata.yaml"
     if not metadata.exists():
-        yield from _open_files(path, max_chunk_bytes, notes)
+        yield from _open_files(path, path.iterdir(), max_chunk_bytes, notes)
         return
     check_regular(metadata)
     try:
@@ -198,11 +198,13 @@ def _open_folder(path: Path, max_chunk_bytes: int, notes: list[str]) -> Iterator
         names = [Path(name).name for name in facts["relative_file_paths"]]
     except (yaml.YAMLError, ValueError, KeyError, TypeError, AttributeError, OSError, RecursionError):
         notes.append(f"{metadata} is not what rosbag2 writes: the files beside it are read as they are")
-        yield from _open_files(path, max_chunk_bytes, notes)
+        yield from _open_files(path, path.iterdir(), max_chunk_bytes, notes)
         return
     if missing := [name for name in names if not (path / name).exists()]:
         notes.append(f"{path} lacks {', '.join(missing)}, which its metadata.yaml names: what is there is read")
-        yield from _open_files(path, max_chunk_bytes, notes)
+        named = [path / name for name in names if name not in missing]
+        useful = any(file.stat().st_size for file in named)
+        yield from _open_files(path, named if useful else path.iterdir(), max_chunk_bytes, notes)
         return
     if not plain_mcap:
         for name in names:
@@ -217,18 +219,26 @@ def _open_folder(path: Path, max_chunk_bytes: int, notes: list[str]) -> Iterator
         yield McapFile(path / name, max_chunk_bytes)
 
 
-def _open_files(path: Path, max_chunk_bytes: int, notes: list[str]) -> Iterator[Source]:
-    """The recordings of one kind that lie in a folder; those that are empty are named."""
-    there = sorted(file for file in path.iterdir() if file.is_file())
-    kinds = {file: kind_of(file) for file in there if file.stat().st_size}
-    files = next((found for kind in _IN_FOLDERS if (found := [file for file in kinds if kinds[file] == kind])), [])
-    if not files:
+def _open_files(path: Path, files: Iterable[Path], max_chunk_bytes: int, notes: list[str]) -> Iterator[Source]:
+    """Those of a folder's files that are recordings of one kind by their names; without any, by what they begin with.
+
+    Recordings that are empty or of another kind are named.
+    """
+    files = sorted(file for file in files if file.is_file())
+    full = [file for file in files if file.stat().st_size]
+    kinds = _by_kind(full, named_kind) or _by_kind(full, kind_of)
+    if not kinds:
         raise RecordingError(f"{path} is no recording: it has no .mcap or .db3 files")
-    empty = [file.name for file in there if file.suffix in _IN_FOLDERS and file not in kinds]
-    others = [file.name for file in kinds if kinds[file] in _IN_FOLDERS and file not in files]
+    empty = [file.name for file in files if named_kind(file) in _IN_FOLDERS and file not in full]
+    others = [file.name for of_a_kind in kinds[1:] for file in of_a_kind]
     notes += [f"{', '.join(names)} in {path} {why}" for names, why in ((empty, _EMPTY), (others, _OTHERS)) if names]
-    for file in files:
+    for file in kinds[0]:
         yield from _open_sources(file, max_chunk_bytes, notes)
+
+
+def _by_kind(files: Sequence[Path], kind_of_file: Callable[[Path], str]) -> list[list[Path]]:
+    """Those of each kind that a folder may hold, the kind first that is read."""
+    return [found for kind in _IN_FOLDERS if (found := [file for file in files if kind_of_file(file) == kind])]
 
 
 def _decoded(source: Source, decoder: Decoder, names: set[str]) -> Iterator[Message]:
