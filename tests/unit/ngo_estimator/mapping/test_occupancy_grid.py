@@ -38,6 +38,24 @@ def test_a_slanted_ray_passes_the_cells_that_it_crosses() -> None:
     assert drawn(grid.cells(SURE).cropped()) == ["?.#", "..?"]
 
 
+def test_a_wall_that_rays_meet_at_a_small_angle_has_no_free_cells() -> None:
+    """The robot drives along a corridor of 1 m, and looks ahead."""
+    grid, angles = OccupancyGrid(0.05), np.linspace(-0.6, 0.6, 140)
+    poses = np.column_stack((np.linspace(0.0, 2.0, 9), np.zeros((9, 2))))
+    walls = np.where(angles > 0.0, 0.51, -0.49)  # each in the middle of a row
+    ahead = [np.minimum(walls / np.sin(angles), (8.01 - x) / np.cos(angles)) for x in poses[:, 0]]
+    grid.add([range_scan(angles, ranges, np.zeros(3), 20.0) for ranges in ahead], poses)
+    found = grid.cells(OccupancyConfig())
+    column = int((3.5 - found.origin_xy[0]) / 0.05)
+
+    def free(y: float) -> np.ndarray:
+        row = found.values[int((y - found.origin_xy[1]) / 0.05), column : column + 60]
+        return (row >= 0) & (row <= 25)
+
+    assert not free(0.5).any() and not free(-0.5).any()
+    assert free(0.25).all()
+
+
 def test_probabilities_are_sums_of_log_odds() -> None:
     grid = OccupancyGrid(1.0)
     scan, pose = rays((0.0, 1.0)), ORIGIN

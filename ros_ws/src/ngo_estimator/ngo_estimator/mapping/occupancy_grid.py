@@ -22,6 +22,7 @@ UNKNOWN = -1
 
 _CHUNK = 64  # cells by which the grid grows
 _MOST_CELLS = 40_000_000
+_MOST_GRAZED = 24.0  # cells at the end of a ray that are not called free, however flat it meets a wall
 Counts = NDArray[np.int32]
 Epochs = NDArray[np.int64]
 
@@ -235,9 +236,10 @@ def _count(
                 _tell(cells[row, column], _HITS, _NEW_HITS, of_scans[s], sign)
         for ray in range(starts[s], starts[s + 1]):
             x, y = eyes[s, 0], eyes[s, 1]
-            along_x, along_y = ends[ray, 0] - x, ends[ray, 1] - y
+            free = _free_share(ends, is_hit, starts[s], starts[s + 1], ray, x, y)
+            along_x, along_y = free * (ends[ray, 0] - x), free * (ends[ray, 1] - y)
             column, row = math.floor(x), math.floor(y)
-            columns, rows = abs(math.floor(ends[ray, 0]) - column), abs(math.floor(ends[ray, 1]) - row)
+            columns, rows = abs(math.floor(x + along_x) - column), abs(math.floor(y + along_y) - row)
             step_x, step_y = 1 if along_x > 0.0 else -1, 1 if along_y > 0.0 else -1
             per_x = 1.0 / abs(along_x) if along_x != 0.0 else math.inf
             per_y = 1.0 / abs(along_y) if along_y != 0.0 else math.inf
@@ -253,6 +255,32 @@ def _count(
                     column, columns, next_x = column + step_x, columns - 1, next_x + per_x
                 else:
                     row, rows, next_y = row + step_y, rows - 1, next_y + per_y
+
+
+@njit(cache=True)
+def _free_share(
+    ends: Array, is_hit: NDArray[np.bool_], first: int, end: int, ray: int, eye_x: float, eye_y: float
+) -> float:
+    """Up to which share of it a ray says that cells are free, 0 to 1: not where it grazes the wall that it meets.
+
+    A ray that meets a wall at a small angle runs through several of the wall's cells before it ends in one: it is less
+    than a cell away from the wall there. The wall goes on to where the next rays end; of those on both sides the one
+    that makes it steeper counts, as the other one may have met something else.
+    """
+    if not is_hit[ray]:
+        return 1.0
+    x, y = ends[ray, 0] - eye_x, ends[ray, 1] - eye_y
+    length, sine = math.hypot(x, y), 0.0
+    for other in (ray - 1, ray + 1):
+        if first <= other < end and is_hit[other]:
+            wall_x, wall_y = ends[other, 0] - ends[ray, 0], ends[other, 1] - ends[ray, 1]
+            cross = abs(x * wall_y - y * wall_x)
+            if cross > 0.0:
+                sine = max(sine, cross / (length * math.hypot(wall_x, wall_y)))
+    if sine == 0.0:
+        return 1.0
+    grazes = min(max(1.0 / sine - 1.0, 0.0), _MOST_GRAZED)  # cells
+    return max(0.0, 1.0 - grazes / length)
 
 
 @njit(cache=True)
