@@ -106,10 +106,14 @@ def test_a_scan_that_is_published_again_is_left_out(late_ns: int) -> None:
 
 
 def test_a_simulated_robot_that_stands_sees_the_same_at_its_usual_pace() -> None:
-    scanner, scans = Scanner(), drive(10, noise_m=0.0)
+    """Also where it stood from the beginning, and something moved once."""
+    scans = drive(10, noise_m=0.0)
     standing = [replace(scans[-1], stamp_ns=scans[-1].stamp_ns + k * 10**8) for k in range(1, 20)]
-    assert all(scanner.correct(scan, 0.0) is not None for scan in [*scans, *standing])
-    assert scanner.remarks("laser") == []
+    since = [replace(scans[0], stamp_ns=scan.stamp_ns + 2 * 10**9) for scan in standing]
+    for seen in ([*scans, *standing], [*standing, *since]):
+        scanner = Scanner()
+        assert all(scanner.correct(scan, 0.0) is not None for scan in seen)
+        assert scanner.remarks("laser") == []
 
 
 @pytest.mark.parametrize("direction", [1.0, -1.0])

@@ -12,6 +12,9 @@ from ngo_recordings.scan_stream import LidarScan
 _SOON = 0.75
 """Share of the usual time to other ranges within which the same ones were not measured anew."""
 
+_LONGEST_NS = 1_000_000_000
+"""Scanners need less for a scan: a robot stood where the same ranges came for longer."""
+
 _KEPT = 10
 
 
@@ -30,7 +33,7 @@ class RepeatedScans:
         late_ns = scan.stamp_ns - self._first_ns
         same = self._ranges is not None and np.array_equal(scan.ranges, self._ranges, equal_nan=True)
         if not same:
-            if self._ranges is not None and late_ns > 0:
+            if self._ranges is not None and 0 < late_ns < _LONGEST_NS:
                 self._periods_ns.append(late_ns)
             self._ranges, self._first_ns = scan.ranges, scan.stamp_ns
             return False
