@@ -141,7 +141,7 @@ def test_wheels_whose_pose_stays_while_the_robot_drives_tell_nothing() -> None:
         nonlocal pose
         pose = compose(pose, step)
         wheels.add(at_s * 10**9, pose, WheelTruth())
-        wheels.moved(np.array((0.2, 0.0, 0.0)))
+        wheels.moved(np.array((0.2, 0.0, 0.0)), 1e-4 * np.eye(3))
 
     for k in range(3):
         second(k, np.array((0.2, 0.0, 0.0)))
@@ -157,11 +157,14 @@ def test_wheels_whose_pose_stays_while_the_robot_drives_tell_nothing() -> None:
     np.testing.assert_allclose(motion, between(np.zeros(3), np.array((1.2, 0.0, 0.0))))
 
 
-def test_wheels_of_a_robot_that_stands_count() -> None:
+@pytest.mark.parametrize(("drift_m", "variance"), [(0.0, 1e-4), (0.02, 1e-4), (0.2, 0.1)])
+def test_wheels_of_a_robot_that_stands_count(drift_m: float, variance: float) -> None:
+    """Also where scans drift by and by, and in a corridor, where they do not know how far."""
     wheels = CorrectedWheels(ImuTurns())
     for k in range(60):
         wheels.add(k * 10**9, np.zeros(3), WheelTruth())
-        wheels.moved(np.array((0.004 * (-1) ** k, 0.0, 0.0)))  # a match is never exact
+        wheels.moved(np.array((0.004 * (-1) ** k + drift_m, 0.0, 0.0)), variance * np.eye(3))  # a match is never exact
+        assert not wheels.froze
     assert not wheels.frozen and wheels.motion(10**9, 2 * 10**9) is not None
 
 

@@ -184,7 +184,7 @@ class LidarIntake:
         for scanner in self._scanners.values():
             scanner.moved(step.relative_xyyaw)
         if not step.unsure:
-            self._wheels.moved(step.relative_xyyaw)
+            self._wheels.moved(step.relative_xyyaw, step.covariance)
         late_ns = round(self.front_end.lag_s * 1e9)
         motion = self._wheels.motion(step.from_stamp_ns - late_ns, step.stamp_ns - late_ns)
         elapsed_s = (step.stamp_ns - step.from_stamp_ns) * 1e-9

@@ -42,9 +42,10 @@ _SLIP_RPS = 0.15
 
 _LONGEST_FREEZE_NS = 2_000_000_000
 """Wheels whose pose stays for so long froze, and catch up with what they missed; after longer they stood, unless the
-scans moved by more than this."""
+scans moved by more than this in so long, and by so many deviations. Over a longer time the scans of a robot that stands
+drift as far; in a corridor, at once."""
 
-_FROZEN_M, _FROZEN_RAD = 0.3, 0.3
+_FROZEN_M, _FROZEN_RAD, _FROZEN_NS, _FROZEN_DEVIATIONS = 0.3, 0.3, 5_000_000_000, 3.0
 
 _SCALES = (0.7, 1.4)
 """Wheels within these are the front end's to judge."""
@@ -246,7 +247,8 @@ class CorrectedWheels:
         self._poses: deque[tuple[int, Array]] = deque(maxlen=2000)
         self._speed = np.zeros(2)  # while no wheel slipped
         self._moved_ns = 0  # the stamp at which a pose was last another one
-        self._since = np.zeros(3)  # the motion by scans since then
+        # Since then, of the last seconds: stamps, poses by scans, and variances of position and yaw, summed up.
+        self._path: deque[tuple[int, Array, Array]] = deque()
         self.froze = False
         """Whether the pose ever stayed while the robot drove."""
         self._changed = False  # whether poses are no longer as the wheels say
@@ -274,7 +276,8 @@ class CorrectedWheels:
         made = stamp_ns + round((truth.age_s - truth.offset_s) * 1e9), scaled
         if not self._raw or stamp_ns > self._raw[-1][0]:
             if not self._raw or not np.array_equal(pose, self._raw[-1][1]):
-                self._moved_ns, self._since = stamp_ns, np.zeros(3)
+                self._moved_ns = stamp_ns
+                self._path.clear()
             self._raw.append((stamp_ns, pose))
             self._poses.append(made)
         return made
@@ -298,17 +301,28 @@ class CorrectedWheels:
         self._poses.clear()
         return [self.add(stamp_ns, pose, truth) for stamp_ns, pose in raw]
 
-    def moved(self, step: Array) -> None:
-        """Take the motion ``(3,)`` from scan to scan, by the scans."""
-        self._since = compose(self._since, step)
+    def moved(self, step: Array, covariance: Array) -> None:
+        """Take the motion ``(3,)`` from scan to scan, by the scans, and its covariance ``(3, 3)``."""
+        if not self._raw:
+            return
+        now_ns, variances = self._raw[-1][0], np.array((covariance[0, 0] + covariance[1, 1], covariance[2, 2]))
+        if self._path:
+            step, variances = compose(self._path[-1][1], step), self._path[-1][2] + variances
+        self._path.append((now_ns, step, variances))
+        while self._path[0][0] < now_ns - _FROZEN_NS:
+            self._path.popleft()
         if self.frozen:
             self.froze = self._changed = True
 
     @property
     def frozen(self) -> bool:
         """Whether the pose stays while the robot drives: it tells nothing then."""
-        stayed = bool(self._raw) and self._raw[-1][0] - self._moved_ns > _LONGEST_FREEZE_NS
-        return stayed and (math.hypot(*self._since[:2]) > _FROZEN_M or abs(self._since[2]) > _FROZEN_RAD)
+        if not self._path or self._raw[-1][0] - self._moved_ns <= _LONGEST_FREEZE_NS:
+            return False
+        (_, begin, before), (_, end, after) = self._path[0], self._path[-1]
+        x, y, turn = between(begin, end)
+        least = np.maximum((_FROZEN_M, _FROZEN_RAD), _FROZEN_DEVIATIONS * np.sqrt(after - before))
+        return bool(math.hypot(x, y) > least[0] or abs(wrap(turn)) > least[1])
 
     def motion(self, from_ns: int, to_ns: int) -> Array | None:
         """The motion ``(3,)`` between two stamps; None where it is not known."""
