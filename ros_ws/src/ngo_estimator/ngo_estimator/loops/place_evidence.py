@@ -123,6 +123,12 @@ def last_stretch(poses: np.ndarray, first: int, most_m: float = STRETCH_M) -> np
     return np.arange(len(poses) - 1 - int(np.searchsorted(to_end, most_m)), len(poses))
 
 
+def stretch_length_m(poses: np.ndarray) -> float:
+    """How long the last stretch of the way of poses ``(keys, 3)`` is, in quarters of the longest."""
+    length_m, quarter_m = float(np.hypot(*np.diff(poses[:, :2], axis=0).T).sum()), 0.25 * STRETCH_M
+    return min(STRETCH_M, quarter_m * max(1.0, float(np.ceil(length_m / quarter_m))))
+
+
 def place_evidence(place: PlacedScans, stretch: Sequence[PlacedScans], count_walls: bool = True) -> PlaceEvidence:
     """The evidence of the parts of a stretch, each of some scans, in the frame of the place's scans."""
     counts, possible = [], 1

@@ -16,7 +16,14 @@ from ngo_estimator.geometry.branch_and_bound import pooled_grid, search
 from ngo_estimator.geometry.key_scan import KeyScan
 from ngo_estimator.geometry.planar_motion import between, compose, transformed, turned_covariance
 from ngo_estimator.loops.key_scan_views import KeyScanViews
-from ngo_estimator.loops.place_evidence import STRETCH_M, PlaceEvidence, evidence_at, evidence_of, last_stretch
+from ngo_estimator.loops.place_evidence import (
+    STRETCH_M,
+    PlaceEvidence,
+    evidence_at,
+    evidence_of,
+    last_stretch,
+    stretch_length_m,
+)
 from ngo_estimator.loops.scan_fit import fit, search_points
 from ngo_estimator.loops.scan_settings import ScanLoopConfig
 from ngo_estimator.loops.scan_submaps import SUBMAP_VARIANCE, ScanSubmaps, laid_together
@@ -130,20 +137,21 @@ class ScanMatcher:
         if self._evidence(pose).is_clear:
             return True
         there = int(np.linalg.norm(self._poses[:, :2] - pose[:2], axis=1).argmin())
-        return False if self._is_ambiguous(there // WAY_KEYS) else None
+        half = WAY_KEYS // 2
+        first = max(0, min(there // half * half - half // 2, len(self._scans) - WAY_KEYS))
+        return False if self._is_ambiguous(first) else None
 
-    def _is_ambiguous(self, part: int) -> bool:
-        """Whether places look alike in a part of the map, to a robot that has seen as much as this one."""
-        steps = np.diff(np.stack(self._odometry)[:, :2], axis=0)
-        way_m = min(STRETCH_M, float(np.ceil(np.hypot(*steps.T).sum())))
-        if (part, way_m) not in self._ambiguous:
-            keys = slice(part * WAY_KEYS, (part + 1) * WAY_KEYS)
+    def _is_ambiguous(self, first: int) -> bool:
+        """Whether places look alike among the key scans from ``first`` on, to a robot that has seen as much."""
+        way_m = stretch_length_m(np.stack(self._odometry))
+        if (first, way_m) not in self._ambiguous:
+            keys = slice(first, first + WAY_KEYS)
             scans, views = self._scans[keys], self._views.of_keys(range(*keys.indices(len(self._scans))))
             searched = any(len(scan.points) for scan in scans) and ScanMatcher(
                 scans, self._poses[keys], views, self._config, REACH_M
             )
-            self._ambiguous[part, way_m] = bool(searched and searched.has_alike_places(way_m))
-        return self._ambiguous[part, way_m]
+            self._ambiguous[first, way_m] = bool(searched and searched.has_alike_places(way_m))
+        return self._ambiguous[first, way_m]
 
     def has_alike_places(self, way_m: float = STRETCH_M) -> bool:
         """Whether places look alike in the map: it is searched in itself, where the truth is known.
