@@ -195,6 +195,23 @@ def test_scans_of_one_scanner_all_count() -> None:
         assert scanner.correct(turned, 0.0) is not None
 
 
+def test_halves_of_a_turn_in_one_frame_all_count() -> None:
+    """Each is like the one before the last, and has no ray in common with the last."""
+    scanner = Scanner()
+    for k, scan in enumerate(drive(60)):
+        seen = (np.abs(scan.angles) < 0.5 * math.pi) == bool(k % 2)
+        assert scanner.correct(replace(scan, ranges=np.where(seen, scan.ranges, np.float32(np.inf))), 0.0) is not None
+
+
+def test_all_scans_of_a_robot_that_sways_at_half_their_rate_count() -> None:
+    scanner, noise, angles = Scanner(), np.random.default_rng(0), np.linspace(-math.pi, math.pi, RAYS, endpoint=False)
+    for k in range(80):
+        pose = compose(np.array((1.0, 1.0, 0.2)), np.array((0.02 * k, 0.0, 0.12 * (-1) ** k)))
+        ranges = (cast(ROOM, pose, angles) + noise.normal(0.0, 0.005, RAYS)).astype(np.float32)
+        scan = LidarScan(k * 10**8, -math.pi, math.tau / RAYS, ranges, 0.05, 30.0, 0.0, "laser")
+        assert scanner.correct(scan, 0.0) is not None
+
+
 def poses_of(offset: Array, count: int, begin: int = 0) -> list[WheelPose]:
     """Of an odometry that began elsewhere."""
     path = [np.array((0.1 * k, 0.02 * k, 0.01 * k)) for k in range(begin, begin + count)]

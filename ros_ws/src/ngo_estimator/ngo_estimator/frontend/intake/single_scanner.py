@@ -13,6 +13,12 @@ from ngo_recordings.scan_stream import LidarScan
 Ranges = NDArray[np.float32]
 
 _DIRECTIONS = 90
+_TURNS = range(-5, 6)
+"""Directions by which a robot may turn from scan to scan: one that sways comes back to the one before the last, too."""
+
+_COMMON = 0.5
+"""Share of a scan's rays that another one must have, too: otherwise they may be halves of one turn."""
+
 _ALIKE = 0.5
 """Two scans are alike where they differ by less than this share of what another one differs."""
 
@@ -60,14 +66,16 @@ class SingleScanner:
         if len(self._last) == 2:
             before, first = self._last[0]
             far = _apart(seen, before)
-            alternates = near > _LEAST_M and far < _ALIKE * near
+            if far < _ALIKE * near < np.inf:
+                near = min(_apart(np.roll(seen, turn), last) for turn in _TURNS)
+            alternates = _LEAST_M < near < np.inf and far < _ALIKE * near
             self._alternates.append(alternates)
             if alternates and first == second:  # both were taken for one
                 self._last[-1] = last, False
                 return True
             if alternates or near < _ALIKE * far:
                 return first if alternates else second
-        return second if near < _LEAST_M else not second
+        return not second if _LEAST_M < near < np.inf else second
 
     def remark(self) -> str:
         """In words; nothing where there is one scanner."""
@@ -77,8 +85,9 @@ class SingleScanner:
 
 
 def _apart(one: Ranges, other: Ranges) -> float:
-    """How far the ranges of two scans are apart in the median (m)."""
+    """How far the ranges of two scans are apart in the median (m); infinite where they have too little in common."""
     if len(one) != len(other):
         return np.inf
-    both = np.isfinite(one) & np.isfinite(other)
-    return float(np.median(np.abs(one[both] - other[both]))) if both.any() else np.inf
+    seen = np.isfinite(other)
+    both = np.isfinite(one) & seen
+    return float(np.median(np.abs(one[both] - other[both]))) if both.sum() > _COMMON * seen.sum() else np.inf
