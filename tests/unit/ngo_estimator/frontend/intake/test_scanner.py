@@ -68,16 +68,28 @@ def test_what_stands_in_the_room_is_no_value_of_no_return() -> None:
     assert found.values == [] and turning.values == [] and itself.values == []
 
 
-@pytest.mark.parametrize(("limit_m", "unit"), [(30.0, 1.0), (30_000.0, 0.001), (0.0, 1.0)])
-def test_ranges_in_millimetres_are_told_and_scaled(limit_m: float, unit: float) -> None:
+@pytest.mark.parametrize(
+    ("limit_m", "unit", "least_m"), [(30.0, 1.0, 0.05), (30_000.0, 0.001, 50.0), (0.0, 1.0, 0.05), (0.0, 0.001, 50.0)]
+)
+def test_ranges_in_millimetres_are_told_and_scaled(limit_m: float, unit: float, least_m: float) -> None:
     scanner = Scanner()
     for scan in drive(10):
-        wrong = replace(scan, ranges=np.round(scan.ranges * 1000.0), range_max=limit_m, range_min=0.05 / unit)
+        wrong = replace(scan, ranges=np.round(scan.ranges * 1000.0), range_max=limit_m, range_min=least_m)
         found = scanner.correct(wrong, 0.0)
     assert found is not None
     np.testing.assert_allclose(found.ranges, scan.ranges, atol=0.001)
     assert found.range_max == pytest.approx(limit_m * unit) and found.range_min == pytest.approx(0.05)
     assert scanner.remarks("laser") == ["laser: its ranges are in millimetres: taken so"]
+
+
+def test_a_driver_that_begins_with_ranges_far_away_is_in_metres_again() -> None:
+    scanner, scans = Scanner(), drive(20)
+    for scan in scans[:5]:
+        scanner.correct(replace(scan, ranges=1000.0 * scan.ranges), 0.0)
+    assert scanner.remarks("laser")
+    for scan in scans[5:]:
+        found = scanner.correct(scan, 0.0)
+    assert found is not None and np.array_equal(found.ranges, scan.ranges) and not scanner.remarks("laser")
 
 
 def test_ranges_far_away_and_codes_for_no_return_are_metres() -> None:

@@ -6,11 +6,14 @@ import numpy as np
 
 from ngo_recordings.scan_stream import LidarScan
 
-_FAR_M = 150.0
-"""No scanner of a robot sees so far in nearly all directions."""
+_FAR = 150.0
+"""No scanner of a robot sees so far (m) in nearly all directions, nor so little (mm)."""
+
+_LEAST_LIMIT_M = 1.0
+"""A driver's smallest range is less; a larger number is in millimetres."""
 
 _NEARLY_ALL = 0.1
-"""Share of the ranges that may be nearer."""
+"""Share of the ranges that may be nearer, or farther."""
 
 _FEWEST = 20
 _DISTINCT = 0.25
@@ -29,16 +32,17 @@ class RangeUnit:
         self._doubted = 0
 
     def metres(self, scan: LidarScan) -> LidarScan:
-        """The scan in metres, also its limits where these hold the ranges."""
-        least = _nearly_least(scan.ranges)
-        if not self.millimetres:
-            self._doubted = self._doubted + 1 if least > _FAR_M else 0
-            self.millimetres = self._doubted >= _SCANS
+        """The scan in metres, also its limits where these are not."""
+        near, far = _nearly_all(scan.ranges)
+        doubted = 0.0 < far < _FAR if self.millimetres else near > _FAR
+        self._doubted = self._doubted + 1 if doubted else 0
+        if self._doubted >= _SCANS:
+            self.millimetres, self._doubted = not self.millimetres, 0
         if not self.millimetres:
             return scan
         low, high = scan.range_min, scan.range_max
-        if high > max(least, _FAR_M):
-            low, high = 0.001 * low, 0.001 * high
+        low = 0.001 * low if low > _LEAST_LIMIT_M else low
+        high = 0.001 * high if high > max(near, _FAR) else high
         return replace(scan, ranges=scan.ranges * _METRES, range_min=low, range_max=high)
 
     def remark(self) -> str:
@@ -46,9 +50,11 @@ class RangeUnit:
         return "its ranges are in millimetres: taken so" if self.millimetres else ""
 
 
-def _nearly_least(ranges: np.ndarray) -> float:
-    """The range that nearly all others exceed; 0 where these are few, or alike."""
+def _nearly_all(ranges: np.ndarray) -> tuple[float, float]:
+    """Between which nearly all ranges lie; 0 and 0 where these are few, or alike."""
     seen = ranges[np.isfinite(ranges) & (ranges > 0.0)]
     if len(seen) < _FEWEST or len(np.unique(seen)) < _DISTINCT * len(seen):
-        return 0.0
-    return float(np.partition(seen, round(_NEARLY_ALL * len(seen)))[round(_NEARLY_ALL * len(seen))])
+        return 0.0, 0.0
+    least = round(_NEARLY_ALL * len(seen))
+    near, far = np.partition(seen, (least, len(seen) - 1 - least))[[least, -1 - least]]
+    return float(near), float(far)
