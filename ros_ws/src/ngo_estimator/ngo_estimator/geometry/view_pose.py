@@ -56,9 +56,8 @@ class RangedRays:
         """These points, then the others."""
         return RangedRays(*(np.concatenate((getattr(self, x.name), getattr(others, x.name))) for x in fields(self)))
 
-    def __getitem__(self, which: np.ndarray | np.ndarray) -> "RangedRays":
+    def __getitem__(self, which: np.ndarray) -> "RangedRays":
         return RangedRays(self.origins[which], self.rays[which], self.inverse[which], self.inverse_std[which])
-
 
     @property
     def known(self) -> np.ndarray:

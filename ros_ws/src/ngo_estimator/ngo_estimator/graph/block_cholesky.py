@@ -36,10 +36,10 @@ class BlockStructure:
             raise ValueError(f"pairs join rows {self.pairs.min()} to {self.pairs.max()}; expected 0 to {count - 1}")
         self.count = count
         self.rank, self.starts, self.rows = _eliminated(self.pairs, count, float(most_work))
-        self.complete = len(self.starts) == count + 1
-        """Whether the order of elimination was found to its end."""
         """Place of each row in the order ``(count,)``; where the blocks of each column begin ``(count + 1,)``; the
         places of their rows ``(blocks,)``, ascending in a column."""
+        self.complete = len(self.starts) == count + 1
+        """Whether the order of elimination was found to its end."""
 
     @property
     def blocks(self) -> int:
