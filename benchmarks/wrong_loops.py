@@ -5,13 +5,12 @@
 One core, one thread, processor time. Graphs with 10,000 loops have a poor odometry, and two thirds of their loops are
 wrong; loops know the whole relative pose, or only "the same place". The last graph has 20,000 nodes, and 30 % of its
 14,286 loops are wrong, between any two nodes. ``solved`` is that of ``training.results_graphs``. Each graph is a line;
-the last line is one JSON object. Exit code 1 where a graph takes longer than its bar: 1 s, and 10 s of 20,000 nodes.
+the last line is one JSON object. ``of_goal`` is the time as a share of the goal: 1 s, and 10 s of 20,000 nodes.
 """
 
 from __future__ import annotations
 
 import json
-import sys
 import time
 from dataclasses import dataclass
 
@@ -24,7 +23,7 @@ from training.baselines.graph_peers import least_squares
 from training.results_graphs import SOLVED
 from training.scoring.graph_problems import synthetic
 
-_BAR_S = {3333: 1.0, 20_000: 10.0}
+_GOAL_S = {3333: 1.0, 20_000: 10.0}
 _CASES = [(kind, 67, 3333, metric) for kind in ("random", "local", "grouped", "lookalike") for metric in (False, True)]
 _CASES.append(("random", 30, 20_000, True))
 
@@ -55,7 +54,7 @@ def measure(seed: int) -> list[dict[str, str | float | bool]]:
                 "nodes": nodes,
                 "loops": len(problem.loops),
                 "seconds": round(seconds, 2),
-                "bar_s": _BAR_S[nodes],
+                "of_goal": round(seconds / _GOAL_S[nodes], 2),
                 "ate_m": round(ate_m, 3),
                 "solved": ate_m <= SOLVED * judged.ate_m(least_squares(right)),
             }
@@ -64,12 +63,11 @@ def measure(seed: int) -> list[dict[str, str | float | bool]]:
     return found
 
 
-def main(arguments: Arguments) -> int:
-    """Measure, print, and return the exit code."""
+def main(arguments: Arguments) -> None:
+    """Measure and print."""
     found = in_process(two_cores()[0], measure, arguments.seed)
     print(json.dumps({"seed": arguments.seed, "graphs": found}))
-    return int(any(float(each["seconds"]) > float(each["bar_s"]) for each in found))
 
 
 if __name__ == "__main__":
-    sys.exit(main(tyro.cli(Arguments, description=__doc__)))
+    main(tyro.cli(Arguments, description=__doc__))
