@@ -3,6 +3,7 @@
 import contextlib
 import json
 import os
+import sys
 from collections.abc import Callable
 from dataclasses import replace
 from functools import lru_cache
@@ -184,6 +185,19 @@ def test_an_array_in_another_order_of_memory_is_read_as_it_was(tmp_path: Path) -
     found = read_state(tmp_path / "state", {})
     np.testing.assert_array_equal(found["rows"], array)
     assert found["count"].shape == ()
+
+
+def test_without_the_library_of_states_saving_and_loading_end_in_one_line(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    write_state(tmp_path / "state", {"map": 1}, {"a": np.zeros(3)})
+    monkeypatch.setitem(sys.modules, "safetensors", None)
+    monkeypatch.setitem(sys.modules, "safetensors.numpy", None)
+    with pytest.raises(StateError, match="need the Python package safetensors"):
+        write_state(tmp_path / "new", {"map": 1}, {"a": np.zeros(3)})
+    with pytest.raises(StateError, match="need the Python package safetensors"):
+        read_state(tmp_path / "state", {"map": 1})
+    assert not (tmp_path / "new").exists()
 
 
 def test_an_empty_trajectory_is_not_saved() -> None:

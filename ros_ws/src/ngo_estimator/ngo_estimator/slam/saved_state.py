@@ -27,12 +27,11 @@ def write_state(folder: Path, identity: Mapping[str, Any], arrays: Arrays) -> No
     that of ``ngo_node`` and the scans of ``ngo_map`` need a folder each.
 
     Raises:
-        StateError: the folder holds other files or a state of the other kind, or cannot be written.
+        StateError: the folder holds other files or a state of the other kind, or cannot be written; or safetensors is
+            not installed.
     """
     # It writes the memory as it is.
-    from safetensors.numpy import save  # a node that saves nothing does without it
-
-    content = save({name: np.require(array, requirements="C") for name, array in arrays.items()})
+    content = _safetensors().numpy.save({name: np.require(array, requirements="C") for name, array in arrays.items()})
     digest = hashlib.sha256(content).hexdigest()
     name = f"arrays-{digest[:16]}.safetensors"
     description = {"format": FORMAT, "identity": dict(identity), "arrays": name, "arrays_sha256": digest}
@@ -83,13 +82,20 @@ def read_state(folder: Path, identity: Mapping[str, Any]) -> Arrays:
     content = _read(arrays)
     if hashlib.sha256(content).hexdigest() != description["arrays_sha256"]:
         raise StateError(f"{arrays}: is damaged (its sha256 is not the one in {DESCRIPTION})")
-    from safetensors import SafetensorError
-    from safetensors.numpy import load
-
+    library = _safetensors()
     try:
-        return load(content)
-    except SafetensorError as error:
+        return dict(library.numpy.load(content))
+    except library.SafetensorError as error:
         raise StateError(f"{arrays}: is no safetensors file ({error})") from error
+
+
+def _safetensors() -> Any:
+    """The library; a node that saves and loads nothing does without it."""
+    try:
+        import safetensors.numpy
+    except ImportError as error:
+        raise StateError("saved states need the Python package safetensors, which is not installed") from error
+    return safetensors
 
 
 def _kind(identity: Mapping[str, Any]) -> str:
