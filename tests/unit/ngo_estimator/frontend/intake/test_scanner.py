@@ -239,6 +239,28 @@ def test_of_two_odometries_on_a_topic_the_first_counts() -> None:
     assert [kept for each in late for kept in single.add(each)] == late
 
 
+def test_of_two_odometries_that_begin_at_one_place_one_counts() -> None:
+    """The other one says 5 % more, of the way or of turns."""
+    for more in ((1.05, 1.05, 1.0), (1.0, 1.0, 1.05)):
+        single, kept = SingleWheels(), list[WheelPose]()
+        for k in range(400):
+            pose = np.array((0.02 * k, 0.0, 0.01 * k))
+            for scale, after_ns in (((1.0, 1.0, 1.0), 0), (more, 10**7)):
+                kept += single.add(WheelPose(k * 4 * 10**7 + after_ns, pose * scale))
+        late = [each for each in kept if each.stamp_ns > 8 * 10**9]
+        assert len({each.stamp_ns % (4 * 10**7) for each in late}) == 1 and len(late) >= 199
+        assert "of another odometry on the same topic" in single.remark()
+
+
+@pytest.mark.parametrize("noise_m", [0.0, 0.005, 0.05])
+def test_poses_of_one_odometry_all_count(noise_m: float) -> None:
+    """While it stands, drives, turns and drives back, also where its poses jitter."""
+    rng, single, speed = np.random.default_rng(0), SingleWheels(), np.repeat((0.0, 0.03, -0.03, 0.0), 100)
+    path = np.stack((np.cumsum(speed), np.zeros(400), np.cumsum(np.roll(speed, 50))), axis=1)
+    poses = [WheelPose(k * 2 * 10**7, pose) for k, pose in enumerate(path + noise_m * rng.standard_normal((400, 3)))]
+    assert [kept for each in poses for kept in single.add(each)] == poses and single.remark() == ""
+
+
 def test_an_odometry_that_begins_anew_goes_on() -> None:
     single, before, after = SingleWheels(), poses_of(np.zeros(3), 10), poses_of(np.array((5.0, 3.0, 1.0)), 10, begin=10)
     assert [kept for each in (*before, *after) for kept in single.add(each)] == [*before, *after]
