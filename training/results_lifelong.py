@@ -86,17 +86,15 @@ def main(arguments: Arguments) -> dict[str, Any]:
         made[name] = {kind: _measured(name, kind, arguments) for kind in _KINDS[name]}
         how = {"command": _command(arguments, name), "revision": record["revision"]}
         settings = {setting: getattr(arguments, setting) for setting in ("split", *_SETTINGS[name])}
-        if name == "fleet":
-            result |= {**how, "settings": settings, "paired": _paired(made[name], name)}
-            result["tables"][name] = _robots(made[name], name)
-        elif name == "join":
-            result |= {name: {**how, "settings": settings, "paired": _paired(made[name], name)}}
-            result["tables"][name] = _robots(made[name], name)
-        else:
+        if name == "year":
             result |= {
                 "year": {**how, "settings": settings, "ratios": year_ratios(column(made[name]["year"], "learn"))}
             }
             result["tables"]["year"] = year_numbers(column(made[name]["year"], "learn"))
+        else:
+            about = {**how, "settings": settings, "paired": _paired(made[name], name)}
+            result |= about if name == "fleet" else {name: about}
+            result["tables"][name] = _robots(made[name], name)
     lifelong_page.draw(arguments.images, made["fleet"], made["year"].get("year", {}))
     return arguments.publish("lifelong", result, lifelong_page.page(result, arguments.images))
 

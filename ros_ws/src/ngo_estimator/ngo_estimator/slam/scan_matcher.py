@@ -99,6 +99,7 @@ class ScanMatcher:
     def reset(self) -> None:
         """Forget all scans but those of the map."""
         self._recent: list[KeyScan] = []
+        self._profiles: list[np.ndarray] = []
         self._odometry: list[np.ndarray] = []
 
     def append(self, step: RelativeStep, odometry: np.ndarray) -> bool:
@@ -106,6 +107,7 @@ class ScanMatcher:
         if step.key is None:
             return False
         self._recent = [*self._recent, step.key.scan][-_MOST_RECENT:]
+        self._profiles = [*self._profiles, range_profile(step.key.scan)][-_MOST_RECENT:]
         self._odometry = [*self._odometry, odometry][-_MOST_RECENT:]
         return len(self._recent) >= self._config.source_keys
 
@@ -183,10 +185,10 @@ class ScanMatcher:
         odometry = np.stack(self._odometry)
         stretch = last_stretch(odometry, 0)
         at = se2.compose(pose, se2.between(odometry[-1], odometry[stretch]))
-        scans = self._recent[int(stretch[0]) :]
+        scans, profiles = self._recent[int(stretch[0]) :], self._profiles[int(stretch[0]) :]
 
         def part(which: slice) -> PlacedScans:
-            return placed(scans[which], list(map(range_profile, scans[which])), at[which])
+            return placed(scans[which], profiles[which], at[which])
 
         return evidence_at(
             self._scans, self._views, (at, part), (np.arange(len(self._scans)), self._poses), count_walls=True
@@ -194,8 +196,7 @@ class ScanMatcher:
 
     def _source(self) -> PlacedScans:
         newest = slice(-self._config.source_keys, None)
-        scans = self._recent[newest]
-        return laid_together(scans, [range_profile(scan) for scan in scans], np.stack(self._odometry[newest]))
+        return laid_together(self._recent[newest], self._profiles[newest], np.stack(self._odometry[newest]))
 
     def _verified(self, source: PlacedScans, poses: Sequence[np.ndarray]) -> Sightings:
         seen = [self._seen(source, pose) for pose in poses]
