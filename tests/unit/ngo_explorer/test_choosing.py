@@ -93,6 +93,19 @@ def test_no_path_leads_through_a_gap_that_is_too_narrow() -> None:
     assert not line_is_free(wide, start, goal, 0.35)
 
 
+def test_a_robot_in_a_gap_that_is_a_cell_too_narrow_may_leave_on_both_sides() -> None:
+    halves = np.zeros((41, 25), np.int8)
+    halves[[0, -1]] = halves[:, [0, -1]] = halves[21] = 100
+    halves[21, 10:15] = 0
+    known, need_m = KnownMap(0.1, 0.6), 0.32
+    known.update(halves, 0.1, np.zeros(2))
+    above, gap = np.array((1.25, 3.05)), np.array((1.25, 2.25))
+    for start, ways in ((above, 1), (gap, 2)):
+        field = cost_field(known, start, need_m)
+        goals = (np.array((1.25, 3.55)), np.array((1.25, 0.75)))
+        assert [plan_path(known, field, start, goal, need_m) is not None for goal in goals].count(True) == ways
+
+
 def brute_force(first: np.ndarray, between: np.ndarray) -> float:
     return min(
         first[order[0]] + sum(between[a, b] for a, b in zip(order[:-1], order[1:], strict=True))

@@ -25,10 +25,8 @@ def cost_field(known: KnownMap, start_xy: Floats, need_m: float, targets: Floats
     goals = np.zeros((0, 2), np.int64)
     if targets is not None:
         goals = np.array([known.cell(point) for point in targets], np.int64).reshape(-1, 2) // known.block
-    start = _start_block(known, start_xy, need_m)
-    if start is None:
-        return np.full(known.roomy_m.shape, -1, np.int32)
-    return np.asarray(_costs(known.roomy_m, need_m, known.comfort_m, start[0], start[1], goals))
+    starts = _start_blocks(known, start_xy, need_m)
+    return np.asarray(_costs(known.roomy_m, need_m, known.comfort_m, starts, goals))
 
 
 def plan_path(
@@ -67,22 +65,29 @@ def line_is_free(known: KnownMap, begin_xy: Floats, end_xy: Floats, need_m: floa
     return bool(_line(known.state, known.clearance_m, x0, y0, x1, y1, need_m))
 
 
-def _start_block(known: KnownMap, start_xy: Floats, need_m: float) -> tuple[int, int] | None:
-    """The block that the robot is in, or else the nearest one that it can be in."""
+def _start_blocks(known: KnownMap, start_xy: Floats, need_m: float) -> NDArray[np.int64]:
+    """Blocks ``(n, 2)`` that the robot can be in, up to need_m away, or else the nearest one; none: there is none.
+
+    No wall lies between: it would be nearer to such a block than need_m. All of them count, since the one that the robot
+    is in may be cut off by a cell.
+    """
     row, column = (value // known.block for value in known.cell(start_xy))
-    reach = math.ceil(_ESCAPE_M / (known.block * known.resolution_m))
+    side_m = known.block * known.resolution_m
+    reach = math.ceil(_ESCAPE_M / side_m)
     low_row, low_column = max(0, row - reach), max(0, column - reach)
     near = known.roomy_m[low_row : max(0, row + reach + 1), low_column : max(0, column + reach + 1)]
     found = np.argwhere(near >= need_m) + (low_row, low_column)
-    if not len(found):
-        return None
-    best = found[np.argmin(np.sum((found - (row, column)) ** 2, axis=1))]
-    return int(best[0]), int(best[1])
+    away_m = side_m * np.hypot(*(found - (row, column)).T)
+    return found[away_m <= max(need_m, away_m.min(initial=math.inf))]
 
 
 @njit(cache=True)
 def _costs(
-    roomy: NDArray[np.float32], need: float, comfort: float, row0: int, column0: int, goals: NDArray[np.int64]
+    roomy: NDArray[np.float32],
+    need: float,
+    comfort: float,
+    starts: NDArray[np.int64],
+    goals: NDArray[np.int64],
 ) -> NDArray[np.int32]:
     rows, columns = roomy.shape
     costs = np.full((rows, columns), -1, np.int32)
@@ -95,12 +100,14 @@ def _costs(
             awaited[row, column] = True
             left += 1
     heads = np.full(_BUCKETS, -1, np.int64)
-    entries = np.empty(1024, np.int64)
-    following = np.empty(1024, np.int64)
-    used, waiting = 1, 1
-    entries[0], following[0] = row0 * columns + column0, -1
-    heads[0] = 0
-    costs[row0, column0] = 0
+    entries = np.empty(1024 + len(starts), np.int64)
+    following = np.empty(1024 + len(starts), np.int64)
+    used, waiting = len(starts), len(starts)
+    for index in range(len(starts)):
+        row, column = starts[index]
+        entries[index], following[index] = row * columns + column, index - 1
+        costs[row, column] = 0
+    heads[0] = len(starts) - 1
     now = 0
     while waiting > 0:
         entry = heads[now % _BUCKETS]
