@@ -1,6 +1,7 @@
 """Maps drawn by hand, and a robot in them that sees all around without errors."""
 
 import math
+from collections.abc import Callable
 
 import numpy as np
 
@@ -35,17 +36,21 @@ def explore(
     config: ExplorerConfig | None = None,
     boundary: np.ndarray | None = None,
     glass: np.ndarray | None = None,
+    change: Callable[[np.ndarray, float, np.ndarray], None] = lambda *_: None,
 ) -> tuple[Exploration, np.ndarray, list[np.ndarray]]:
     """Explore a map to the end; returns the exploration, what is known then, and where the robot was.
 
-    glass: what its scans show nearby, beside what the map has.
+    glass: what its scans show nearby, beside what the map has. change: changes the truth ``(rows, columns)``, by the
+    time and the robot's pose ``(3,)``.
     """
     config = config or ExplorerConfig(radius_m=0.2)
     exploration = Exploration(config, boundary)
     known = np.full_like(truth, -1)
     follower = PathFollower(DriveConfig(), config)
     pilot, robot, way = Pilot(exploration, follower, 0.5, None), np.array((*start_xy, 0.0)), []
+    truth = truth.copy()
     for step in range(6000):
+        change(truth, 0.1 * step, robot)
         if step % 5 == 0:
             seen_from(truth, known, robot[0], robot[1])
             exploration.known.update(known, RESOLUTION_M, np.zeros(2))

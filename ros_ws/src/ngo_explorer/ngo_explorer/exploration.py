@@ -112,7 +112,7 @@ class Exploration:
         self._decided_s = now_s
         before = self.goal.candidate if self.goal is not None else None
         field = cost_field(self.known, robot, self.need_m)
-        self._look(field)
+        self.candidates, self.unreachable = self._look(field)
         while self.candidates:
             present = self._present(before)
             trail = np.array([*self._trail, robot])
@@ -173,16 +173,49 @@ class Exploration:
         self._may_forget = False
         return self._aside.another_chance() or gone
 
+    def shut_off(self, robot_xy: Floats, home_xy: Floats | None) -> Floats | None:
+        """Where to wait ``(3,)`` for a way that the robot has driven and that has shut since, facing it.
+
+        None where there is none that leads to frontiers or home. Frontiers behind it have that as their reason.
+        """
+        places = np.array([*self._trail, robot_xy] if home_xy is None else [home_xy, *self._trail, robot_xy])
+        here = self._reached(cost_field(self.known, robot_xy, self.need_m), places)
+        lost = ~here & here.any() & (not self._lite)
+        while lost.any():
+            newest = int(np.flatnonzero(lost)[-1])
+            field = cost_field(self.known, places[newest], self.need_m)
+            there = self._reached(field, places)
+            lost[newest], lost[there] = False, False
+            if (there & here).any() or not there.any():
+                continue  # it was near to something there, and no more
+            behind = [candidate.frontier.point_xy.tolist() for candidate in self._look(field)[0]]
+            if behind or (home_xy is not None and there[0]):
+                self.unreachable = [
+                    Left(left.point_xy, "the way there has shut") if left.point_xy.tolist() in behind else left
+                    for left in self.unreachable
+                ]
+                gaps = np.hypot(*(places[here][:, None] - places[there]).transpose(2, 0, 1))
+                near, far = np.unravel_index(np.argmin(gaps), gaps.shape)
+                x, y = places[there][far] - places[here][near]
+                return np.array((*places[here][near], math.atan2(y, x)))
+        return None
+
+    def _reached(self, field: NDArray[np.int32], points: Floats) -> NDArray[np.bool_]:
+        """Which points ``(n, 2)`` paths lead to."""
+        blocks = np.array([self.known.cell(point) for point in points]) // self.known.block
+        row, column = np.clip(blocks + 1, 0, np.array(field.shape) + 1).T
+        return np.asarray(np.pad(field, 1, constant_values=-1)[row, column] >= 0)
+
     def failed(self, reason: str) -> None:
         """The robot could not get to the goal."""
         goal, self.goal = self.goal, None
         if goal is not None and goal.candidate is not None:
             self._aside.add(self.known, goal.candidate.frontier, goal.candidate.viewpoint_xy, reason)
 
-    def _look(self, field: NDArray[np.int32]) -> None:
+    def _look(self, field: NDArray[np.int32]) -> tuple[list[Candidate], list[Left]]:
         """Find the frontiers, those that can be seen and those that cannot."""
         config, known = self.config, self.known
-        candidates, unreachable = [], []
+        candidates, unreachable = list[Candidate](), list[Left]()
         for frontier in self._finder.find(known):
             if not self._boundary.holds(frontier.point_xy):
                 continue
@@ -200,7 +233,7 @@ class Exploration:
                 unreachable.append(Left(frontier.point_xy, "it shows less of the unknown than gain_m2"))
             else:
                 candidates.append(Candidate(frontier, *place))
-        self.candidates, self.unreachable = candidates, unreachable
+        return candidates, unreachable
 
     def _viewpoint(
         self, frontier: Frontier, field: NDArray[np.int32], barred: Floats

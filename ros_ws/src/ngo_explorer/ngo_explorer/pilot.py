@@ -42,6 +42,8 @@ class Pilot:
         self._driver, self._settle_s, self._home = driver, settle_s, home_xyyaw
         self._looks_left = _LOOKS
         self._waits: tuple[float, int] | None = None  # since when the robot waits for the map, and the map then
+        self._shut_s: float | None = None  # since when it waits for a way that has shut
+        self._wait_left_s = exploration.config.wait_s
 
     def step(self, robot_xyyaw: Floats, now_s: float) -> Goal | None:
         """Decide what is to be decided now; returns the present goal."""
@@ -56,7 +58,8 @@ class Pilot:
             self._waits = None
             exploration.arrived()
         elif exploration.goal is not None and self._driver.state == ARRIVED and exploration.goal.candidate is None:
-            exploration.arrived()
+            if self._shut_s is None:  # else it stands there until the goal is given up
+                exploration.arrived()
         if self.state == EXPLORING and exploration.due(robot_xyyaw, now_s):
             self._decide(robot_xyyaw, now_s)
         return exploration.goal
@@ -68,7 +71,7 @@ class Pilot:
             self._look_or_finish(robot_xyyaw, now_s)
             return
         if goal.candidate is not None:
-            self._waits, self._looks_left = None, _LOOKS
+            self._waits, self._looks_left, self._shut_s = None, _LOOKS, None
         self._driver.follow(goal.path, float(goal.pose_xyyaw[2]), new=_other(before, goal))
 
     def _look_or_finish(self, robot_xyyaw: Floats, now_s: float) -> None:
@@ -80,9 +83,24 @@ class Pilot:
             self._driver.follow(pose[None, :2], float(pose[2]), new=True)
             return
         self._driver.stop()
-        if self._settled(now_s) and not self.exploration.another_chance():
+        if self._settled(now_s) and not self.exploration.another_chance() and not self._wait(robot_xyyaw, now_s):
             self.state = RETURNING
             self._return(robot_xyyaw, now_s)
+
+    def _wait(self, robot_xyyaw: Floats, now_s: float) -> bool:
+        """Go where a way has shut, stand and look around again; False where none has, or it lasts too long."""
+        place = self.exploration.shut_off(robot_xyyaw[:2], None if self._home is None else self._home[:2])
+        self._wait_left_s -= 0.0 if self._shut_s is None else now_s - self._shut_s
+        self._shut_s = None if place is None or self._wait_left_s <= 0.0 else now_s
+        if place is None or self._shut_s is None:
+            return False
+        if self.exploration.go_to(robot_xyyaw, place, now_s) is None:
+            place = robot_xyyaw
+            self.exploration.turn_to(place, now_s)
+        assert self.exploration.goal is not None
+        self._driver.follow(self.exploration.goal.path, float(place[2]), new=True)
+        self._waits, self._looks_left = None, _LOOKS
+        return True
 
     def _settled(self, now_s: float) -> bool:
         changes = self.exploration.known.changes
