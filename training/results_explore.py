@@ -36,7 +36,7 @@ from training.report import explore_page
 from training.report.explore_figures import draw_figures
 from training.report.folders import Folders
 from training.scoring import exploring, known_tour, own_poses
-from training.scoring.exploring import Explored, Seen, drive_known_tour, explore
+from training.scoring.exploring import Estimator, Explored, Seen, TruePosesMap, drive_known_tour, explore
 from training.scoring.map_errors import intersections
 from training.scoring.own_poses import OwnPoses
 from training.scoring.statistics import mean_interval
@@ -195,7 +195,7 @@ def _row(name: str, kind: Kind, arguments: Arguments) -> Row:
 
 
 def _measure(
-    place: Place, name: str, most_s: float, estimator: Callable[[np.ndarray], OwnPoses] | None = None
+    place: Place, name: str, most_s: float, estimator: Callable[[np.ndarray], Estimator] = TruePosesMap
 ) -> Measured:
     world = place.make()
     config = ExplorerConfig(rule=name if name in RULES else "tour", radius_m=world.radius_m)

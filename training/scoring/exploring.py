@@ -10,7 +10,9 @@ from typing import Protocol
 
 import numpy as np
 
+from ngo_estimator.data.relative_step import RelativeStep
 from ngo_estimator.mapping.occupancy_grid import UNKNOWN, OccupancyConfig, OccupancyGrid, OccupancyMap
+from ngo_estimator.mapping.scan_map import ScanMap
 from ngo_explorer.exploration import Exploration
 from ngo_explorer.known_map import KnownMap
 from ngo_explorer.path_follower import DRIVING, PathFollower
@@ -76,6 +78,39 @@ class Estimator(Protocol):
         ...
 
 
+class TruePosesMap:
+    """Knows the true poses, and maps as a robot that estimates them does."""
+
+    stamp_ns = 0
+
+    def __init__(self, first_xyyaw: np.ndarray) -> None:
+        self.pose_xyyaw, self._map = first_xyyaw, ScanMap()
+        self._stamps_ns, self._poses = list[int](), list[np.ndarray]()
+
+    def take(self, sight: Sight) -> None:
+        """Take what was seen, and where."""
+        stamp_ns, nothing = round(1e9 * sight.time_s), np.zeros(0, np.float32)
+        self._stamps_ns.append(stamp_ns)
+        self._poses.append(sight.pose_xyyaw)
+        before_ns, first_ns = self._stamps_ns[-2:][0], self._stamps_ns[0]
+        self.pose_xyyaw = sight.pose_xyyaw
+        pose = np.zeros(3), np.eye(3), first_ns, sight.pose_xyyaw
+        self._map.take(RelativeStep(stamp_ns, before_ns, *pose, nothing, nothing), [(stamp_ns, sight.scan)])
+
+    def cells(self) -> OccupancyMap:
+        """The map so far."""
+        self._map.update(np.array(self._stamps_ns), np.array(self._poses))
+        return self._map.cells()
+
+    def aligned_cells(self, truth: TruePoses) -> OccupancyMap:
+        """The same: it is where the truth is."""
+        return self.cells()
+
+    def errors(self, truth: TruePoses) -> dict[str, float]:
+        """None."""
+        return {}
+
+
 class Seen:
     """What can be seen of a world, and how much of it a map holds."""
 
@@ -111,12 +146,11 @@ def explore(
     drive: DriveConfig,
     seed: int = 0,
     most_s: float = 3600.0,
-    estimator: Callable[[np.ndarray], Estimator] | None = None,
+    estimator: Callable[[np.ndarray], Estimator] = TruePosesMap,
 ) -> Explored:
     """Explore a world until the robot says that nothing is left, or for most_s of simulated time.
 
-    estimator: begins one at the first pose; None: the robot knows its true poses. What it has seen is counted at true
-    poses always.
+    estimator: begins one at the first pose. What the robot has seen is counted at true poses always.
     """
     run = _Run(world, seen, estimator)
     exploration = Exploration(config, seed=seed)
@@ -146,28 +180,28 @@ class _Run:
     """A robot on its way, its map and what is written down of both."""
 
     def __init__(
-        self, world: ExploredWorld, seen: Seen, estimator: Callable[[np.ndarray], Estimator] | None = None
+        self, world: ExploredWorld, seen: Seen, estimator: Callable[[np.ndarray], Estimator] = TruePosesMap
     ) -> None:
         self._world, self._seen, self._grid = world, seen, OccupancyGrid(RESOLUTION_M)
         self.sight = world.step(0.0, 0.0)
-        self._estimator = None if estimator is None else estimator(self.sight.pose_xyyaw)
+        self._estimator = estimator(self.sight.pose_xyyaw)
         self._stamps_ns = list[int]()
         self._hear()
         self._rows: list[tuple[float, float, float]] = []
         self._poses, self._decisions_ms = [self.sight.pose_xyyaw], list[float]()
         self._entered: np.ndarray | None = None
         self._mapped_s, self._path_m, self._collisions, self._touched, self._ended = -math.inf, 0.0, 0, False, False
-        self.found = self._own_map()
+        self.found = _trinary(self._estimator.cells())
 
     @property
     def pose_xyyaw(self) -> np.ndarray:
         """Where the robot believes to be."""
-        return self.sight.pose_xyyaw if self._estimator is None else self._estimator.pose_xyyaw
+        return self._estimator.pose_xyyaw
 
     @property
     def late_s(self) -> float:
         """How old that pose is."""
-        known_ns = 0 if self._estimator is None else self._estimator.stamp_ns
+        known_ns = self._estimator.stamp_ns
         return 1e-9 * (self.sight.stamp_ns - known_ns) if known_ns else 0.0
 
     def show(self, follower: PathFollower) -> None:
@@ -176,15 +210,16 @@ class _Run:
         follower.look(scan.ends[scan.hits].astype(np.float64), self.sight.time_s)
 
     def drive(self, exploration: Exploration, follower: PathFollower, most_s: float) -> None:
-        """Explore until nothing is left. Decisions are timed by the time of this process, on one core."""
+        """Explore until nothing is left. Decisions on new maps are timed by the time of this process, on one core."""
         pilot = Pilot(exploration, follower, 2.0 * _MAP_EVERY_S, None)
         follower.stop()
         while self.sight.time_s < most_s and pilot.state != DONE:
-            mapped, decided, begun_s = self.look(), pilot.decided, time.process_time()
+            mapped, decided = self.look(), pilot.decided
+            begun_s = time.process_time() if mapped else 0.0  # to ask for it takes as long as a period
             if mapped or exploration.known.empty:
                 exploration.known.update(self.found.values, RESOLUTION_M, self.found.origin_xy)
             pilot.step(self.pose_xyyaw, self.sight.time_s)
-            if pilot.decided > decided:
+            if mapped and pilot.decided > decided:
                 self._decisions_ms.append(1e3 * (time.process_time() - begun_s))
             self.show(follower)
             self.move(*follower.step(exploration.known, self.pose_xyyaw, self.sight.time_s, self.late_s))
@@ -199,18 +234,14 @@ class _Run:
         if sight.time_s - self._mapped_s < _MAP_EVERY_S - 1e-6:
             return False
         self._mapped_s = sight.time_s
-        self.found = self._own_map()
-        seen = self.found if self._estimator is None else _trinary(self._grid.cells(_OCCUPANCY))
+        self.found = _trinary(self._estimator.cells())
+        seen = _trinary(self._grid.cells(_OCCUPANCY))
         self._rows.append((self._path_m, self._seen.coverage(seen), sight.time_s))
         return True
 
-    def _own_map(self) -> OccupancyMap:
-        return _trinary(self._grid.cells(_OCCUPANCY) if self._estimator is None else self._estimator.cells())
-
     def _hear(self) -> None:
-        if self._estimator is not None:
-            self._estimator.take(self.sight)
-            self._stamps_ns.append(self.sight.stamp_ns)
+        self._estimator.take(self.sight)
+        self._stamps_ns.append(self.sight.stamp_ns)
 
     def move(self, speed_mps: float, turn_rate_rps: float) -> None:
         """Drive for a period."""
@@ -225,11 +256,8 @@ class _Run:
         """What came of it."""
         path, coverage, times = np.array(self._rows).T
         poses, decisions = np.array(self._poses), np.array(self._decisions_ms)
-        errors: dict[str, float] = {}
-        found = self.found
-        if self._estimator is not None:
-            truth = TruePoses(np.array(self._stamps_ns), poses)
-            errors, found = self._estimator.errors(truth), _trinary(self._estimator.aligned_cells(truth))
+        truth = TruePoses(np.array(self._stamps_ns), poses)
+        errors, found = self._estimator.errors(truth), _trinary(self._estimator.aligned_cells(truth))
         true = _trinary(self._grid.cells(_OCCUPANCY))
         counted = self._collisions, self._ended
         return Explored(path, coverage, times, poses, decisions, *counted, found, true, errors)
