@@ -54,11 +54,10 @@ class Pilot:
             self._return(robot_xyyaw, now_s)
         elif exploration.goal is not None and self._driver.state == STUCK:
             exploration.failed("the robot did not get there")
-        elif exploration.goal is not None and self._driver.state == ARRIVED and self._settled(now_s):
-            self._waits = None
-            exploration.arrived()
-        elif exploration.goal is not None and self._driver.state == ARRIVED and exploration.goal.candidate is None:
-            if self._shut_s is None:  # else it stands there until the goal is given up
+        elif exploration.goal is not None and self._driver.state == ARRIVED and self._shut_s is None:
+            # A robot that waits stands there until the goal is given up.
+            if exploration.goal.candidate is None or self._settled(now_s):
+                self._waits = None
                 exploration.arrived()
         if self.state == EXPLORING and exploration.due(robot_xyyaw, now_s):
             self._decide(robot_xyyaw, now_s)
