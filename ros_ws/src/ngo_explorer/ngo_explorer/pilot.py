@@ -42,7 +42,7 @@ class Pilot:
         self._driver, self._settle_s, self._home = driver, settle_s, home_xyyaw
         self._looks_left = _LOOKS
         self._waits: tuple[float, int] | None = None  # since when the robot waits for the map, and the map then
-        self._shut_s: float | None = None  # since when it waits for a way that has shut
+        self._shut_s: float | None = None  # since when it waits for a way that has shut, and stands at its goal
         self._wait_left_s = exploration.config.wait_s
 
     def step(self, robot_xyyaw: Floats, now_s: float) -> Goal | None:
@@ -54,11 +54,9 @@ class Pilot:
             self._return(robot_xyyaw, now_s)
         elif exploration.goal is not None and self._driver.state == STUCK:
             exploration.failed("the robot did not get there")
-        elif exploration.goal is not None and self._driver.state == ARRIVED and self._shut_s is None:
-            # A robot that waits stands there until the goal is given up.
-            if exploration.goal.candidate is None or self._settled(now_s):
-                self._waits = None
-                exploration.arrived()
+        elif exploration.goal is not None and self._shut_s is None and self._seen(exploration.goal, now_s):
+            self._waits = None
+            exploration.arrived()
         if self.state == EXPLORING and exploration.due(robot_xyyaw, now_s):
             self._decide(robot_xyyaw, now_s)
         return exploration.goal
@@ -100,6 +98,10 @@ class Pilot:
         self._driver.follow(self.exploration.goal.path, float(place[2]), new=True)
         self._waits, self._looks_left = None, _LOOKS
         return True
+
+    def _seen(self, goal: Goal, now_s: float) -> bool:
+        """Whether the robot stands at a goal, and the map has what is to be seen there."""
+        return self._driver.state == ARRIVED and (goal.candidate is None or self._settled(now_s))
 
     def _settled(self, now_s: float) -> bool:
         changes = self.exploration.known.changes

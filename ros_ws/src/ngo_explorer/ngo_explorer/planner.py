@@ -68,8 +68,8 @@ def line_is_free(known: KnownMap, begin_xy: Floats, end_xy: Floats, need_m: floa
 def _start_blocks(known: KnownMap, start_xy: Floats, need_m: float) -> NDArray[np.int64]:
     """Blocks ``(n, 2)`` that the robot can be in, up to need_m away, or else the nearest one; none: there is none.
 
-    No wall lies between: it would be nearer to such a block than need_m. All of them count, since the one that the robot
-    is in may be cut off by a cell.
+    No wall lies between: it would be nearer to such a block than need_m. All of them count, since the one that the
+    robot is in may be cut off by a cell.
     """
     row, column = (value // known.block for value in known.cell(start_xy))
     side_m = known.block * known.resolution_m
