@@ -43,16 +43,25 @@ class PictureLoopFinder:
         node, found = len(self._pictures) - 1, PictureLoops.none()
         others, covariances = self._candidates(graph)
         for other, covariance in zip(others.tolist(), covariances, strict=True):
-            points = self._points_of(other, graph.poses)
             turn = float(se2.wrap(graph.poses[node, 2] - graph.poses[other, 2]))
             near = turn, self.config.turn_rad + self.config.deviations * float(np.sqrt(covariance[2, 2]))
-            fitted = fit(self.config, self._pictures[other], self._pictures[node], points, near)
+            fitted = self.fitted(other, self._pictures[node], graph.poses, near)
             if fitted is None or self._surprises(fitted, graph.poses[[other, node]], covariance):
                 continue
             pair, inliers = np.array(((other, node),)), np.array((fitted.inliers,))
             found = found.extended(PictureLoops(pair, fitted.relative[None], fitted.covariance[None], inliers))
         self.loops = self.loops.extended(found)
         return len(found)
+
+    def alike(self, picture: KeyPicture) -> np.ndarray:
+        """How alike a picture is to each node's ``(n,)``; those that are not compared have -inf."""
+        return self._places.alike(picture)
+
+    def fitted(
+        self, node: int, picture: KeyPicture, poses: np.ndarray, near: tuple[float, float]
+    ) -> PictureFit | None:
+        """Where a picture was taken, seen from a node, with poses ``(nodes, 3)`` of all; see ``picture_fit.fit``."""
+        return fit(self.config, self._pictures[node], picture, self._points_of(node, poses), near)
 
     def _surprises(self, fitted: PictureFit, poses: np.ndarray, covariance: np.ndarray) -> bool:
         """Whether a fit is far from where the graph has both nodes ``(2, 3)``: another place looks alike."""
@@ -65,9 +74,8 @@ class PictureLoopFinder:
 
         Also the covariances ``(n, 3, 3)`` with which the graph knows the last node against them, along the map's axes.
         """
-        config, alike = self.config, self._places.alike()
-        node = len(self._pictures) - 1
-        older = alike[: max(0, node - config.recent)]
+        config, node = self.config, len(self._pictures) - 1
+        older = self.alike(self._pictures[node])[: max(0, node - config.recent)]
         ranked = np.argsort(-older, kind="stable")[: config.looked_at]
         ranked = ranked[np.isfinite(older[ranked])]
         if len(ranked) == 0:

@@ -44,16 +44,15 @@ class PicturePlaces:
         for picture in pictures if len(self._words) else ():
             self._vectors.append(self._vector(picture))
 
-    def alike(self) -> np.ndarray:
-        """How alike each earlier key picture is to the last one ``(n,)``; those that are not compared have -inf.
+    def alike(self, picture: KeyPicture) -> np.ndarray:
+        """How alike a picture is to each key picture ``(n,)``; those that are not compared have -inf.
 
         None before there is a vocabulary.
         """
-        last = len(self._vectors) - 1
-        if last < 1:
-            return np.zeros(0)
-        first, found = max(0, last - self._most + 1), np.full(last, -np.inf)
-        found[first:] = self._vectors.slice(first, last) @ self._vectors.slice(last)[0]
+        count = len(self._vectors)
+        first, found = max(0, count - self._most), np.full(count, -np.inf)
+        if count:
+            found[first:] = self._vectors.slice(first) @ self._vector(picture)
         return found
 
     def _vector(self, picture: KeyPicture) -> np.ndarray:

@@ -17,6 +17,7 @@ from ngo_estimator.loops.picture_settings import PictureGraphConfig
 from ngo_estimator.slam.back_end import BackEnd, ClosedLoops, require_sound
 from ngo_estimator.slam.localisation import Localiser
 from ngo_estimator.slam.map_origin import MapOrigin
+from ngo_estimator.slam.picture_matcher import PictureMatcher
 from ngo_estimator.slam.step_log import TakenStep
 
 _KEYS_PER_OPTIMISED = 20
@@ -128,8 +129,8 @@ class PictureBackEnd(BackEnd):
         return len(self._finder.loops) > 0 and self._guarded("an optimisation", self._optimise)
 
     def localiser(self, origin: MapOrigin) -> Localiser:
-        """Raises ``ValueError``: key pictures of an earlier session are not searched yet."""
-        raise ValueError("world:=camera has no localisation in a saved map yet: go on with state_mode continue")
+        """Localises in the key pictures as they are."""
+        return Localiser(PictureMatcher(self._finder, origin.poses(self.graph.poses.copy())))
 
     SAVED = ("graph", "_finder", "_waiting", "closed", "_loops_from_nothing", "_scale")
 
