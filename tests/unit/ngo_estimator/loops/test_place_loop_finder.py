@@ -24,16 +24,23 @@ CENTRE = np.array((0.2, 0.0, 0.8))
 STEPS, ROUND = 45, 30
 
 
-def seen(pose: np.ndarray, points: np.ndarray, looks: np.ndarray) -> KeyPicture:
-    """Those of the points ``(n, 3)`` that are ahead of a robot, each of which looks like nothing else."""
+def seen(pose: np.ndarray, points: np.ndarray, looks: np.ndarray, rough: float) -> KeyPicture:
+    """Those of the points ``(n, 3)`` that are ahead of a robot, each of which looks like nothing else.
+
+    Every other one is found too far to the left, by an angle ``rough``, which its deviation tells.
+    """
     offset = points - camera_at(pose, CENTRE)
     offset[:, :2] = se2.rotate(np.asarray(-pose[2]), offset[:, :2])
     rays = offset / np.linalg.norm(offset, axis=1, keepdims=True)
+    std_rad = np.where(np.arange(len(rays)) % 2, 2e-3, 2e-3 + rough)
+    rays[::2, :2] = se2.rotate(np.asarray(rough), rays[::2, :2])
     ahead = rays[:, 0] > 0.7
-    return KeyPicture(CENTRE, 2e-3, rays[ahead], looks[ahead])
+    return KeyPicture(CENTRE, rays[ahead], std_rad[ahead], looks[ahead])
 
 
-def driven(config: PictureLoopConfig, drift_rad: float, std_rad: float) -> tuple[PictureLoopFinder, np.ndarray]:
+def driven(
+    config: PictureLoopConfig, drift_rad: float, std_rad: float, rough: float = 0.0
+) -> tuple[PictureLoopFinder, np.ndarray]:
     """A finder after one and a half rounds with an odometry that turns too far, and the true poses."""
     rng = np.random.default_rng(1)
     points = rng.uniform((-8.0, -8.0, 0.0), (8.0, 8.0, 3.0), (1200, 3))
@@ -43,11 +50,11 @@ def driven(config: PictureLoopConfig, drift_rad: float, std_rad: float) -> tuple
     angle = np.arange(STEPS) * (2.0 * np.pi / ROUND)
     truth = np.stack((2.0 * np.cos(angle), 2.0 * np.sin(angle), angle + 0.5 * np.pi), axis=1)
     finder, graph = PictureLoopFinder(config), PoseGraph()
-    finder.append(seen(truth[0], points, looks))
+    finder.append(seen(truth[0], points, looks, 0.0))
     for before, pose in zip(truth, truth[1:], strict=False):
         graph.append(se2.between(before, pose) + (0.0, 0.0, drift_rad), np.diag((1e-4, 1e-4, std_rad**2)))
         graph.add_node()
-        finder.append(seen(pose, points, looks))
+        finder.append(seen(pose, points, looks, rough if len(finder) > ROUND else 0.0))
         finder.find(graph)
     return finder, truth
 
@@ -60,6 +67,18 @@ def test_loops_have_the_true_relative_pose() -> None:
     deviations = np.sqrt(np.diagonal(loops.covariance, axis1=1, axis2=2))
     assert (np.abs(off) < 3.0 * deviations).all()
     assert np.abs(off[:, 2]).max() < 0.01 and np.median(np.abs(off)) < 0.02
+
+
+def test_features_that_are_found_roughly_turn_no_loop() -> None:
+    finder, truth = driven(PictureLoopConfig(), drift_rad=0.002, std_rad=0.01, rough=0.03)
+    loops = finder.loops[finder.loops.pairs[:, 1] > ROUND]
+    off = se2.wrapped(loops.relative - se2.between(truth[loops.pairs[:, 0]], truth[loops.pairs[:, 1]]))
+    assert len(loops) > 10 and np.abs(off[:, 2]).max() < 0.01
+
+
+def test_what_is_measured_roughly_is_no_loop() -> None:
+    finder, _ = driven(replace(PictureLoopConfig(), most_rad=0.006), drift_rad=0.002, std_rad=0.01)
+    assert len(finder.loops) == 0
 
 
 def test_a_graph_that_is_sure_of_another_place_takes_no_loop() -> None:

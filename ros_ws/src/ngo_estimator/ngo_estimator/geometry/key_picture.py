@@ -10,7 +10,7 @@ MOST_FEATURES = 2000
 """Of a key picture: it bounds the time and memory that a message may cost."""
 
 _LENGTHS = (8, 512)
-_HEADER = 5
+_HEADER = 4
 
 
 @dataclass(frozen=True, eq=False)
@@ -19,49 +19,48 @@ class KeyPicture:
 
     Attributes:
         centre: of the camera in the robot's base frame ``(3,)``, m.
-        pixel_rad: the angle that a pixel sees.
         rays: unit vectors ``(n, 3)`` to the features, in base axes.
+        std_rad: deviations ``(n,)`` of the rays.
         descriptors: ``(n, d)`` float32 unit vectors: the nearer two are, the more alike the features.
     """
 
     centre: Array
-    pixel_rad: float
     rays: Array
+    std_rad: Array
     descriptors: np.ndarray
 
     def __len__(self) -> int:
         return len(self.rays)
 
     def packed(self) -> np.ndarray:
-        """All of it in one vector ``(5 + n (3 + d),)``, as the place code of a step carries it."""
-        head = np.array((self.descriptors.shape[1], *self.centre, self.pixel_rad), np.float32)
-        rows = np.concatenate((self.rays.astype(np.float32), self.descriptors), axis=1)
-        return np.concatenate((head, rows.ravel()))
+        """All of it in one vector ``(4 + n (4 + d),)``, as the place code of a step carries it."""
+        head = (self.descriptors.shape[1], *self.centre)
+        rows = np.concatenate((self.rays, self.std_rad[:, None], self.descriptors), axis=1)
+        return np.concatenate((head, rows.ravel())).astype(np.float32)
 
     @classmethod
     def unpacked(cls, code: np.ndarray) -> "KeyPicture":
         """The picture of a place code; raises ``ValueError`` for one that is not a key picture's."""
         length = int(code[0]) if len(code) >= _HEADER and np.isfinite(code).all() else 0
-        if not _LENGTHS[0] <= length <= _LENGTHS[1] or (len(code) - _HEADER) % (3 + length):
+        if not _LENGTHS[0] <= length <= _LENGTHS[1] or (len(code) - _HEADER) % (4 + length):
             raise ValueError(
                 f"place_code of {len(code)} numbers is no key picture: is it from local_node with world:=camera?"
             )
-        rows = code[_HEADER:].reshape(-1, 3 + length)
-        if len(rows) > MOST_FEATURES or not 0.0 < code[4] < 1.0:
+        rows = code[_HEADER:].reshape(-1, 4 + length)
+        rays, std_rad, descriptors = rows[:, :3].astype(np.float64), rows[:, 3].astype(np.float64), rows[:, 4:]
+        if len(rows) > MOST_FEATURES or not ((std_rad > 0.0) & (std_rad < 1.0)).all():
             raise ValueError(
-                f"place_code has {len(rows)} features with pixels of {code[4]:g} rad; expected at most "
-                f"{MOST_FEATURES}, and an angle of 0 to 1"
+                f"place_code has {len(rows)} features; expected at most {MOST_FEATURES}, with deviations of 0 to 1 rad"
             )
-        rays, descriptors = rows[:, :3].astype(np.float64), rows[:, 3:]
         sizes = np.concatenate((np.linalg.norm(rays, axis=1), np.linalg.norm(descriptors, axis=1)))
         if (np.abs(sizes - 1.0) > 0.01).any():
             raise ValueError("place_code has rays or descriptors that are not unit vectors")
-        return cls(code[1:4].astype(np.float64), float(code[4]), rays, descriptors.copy())
+        return cls(code[1:4].astype(np.float64), rays, std_rad, descriptors.copy())
 
 
 def nothing_seen() -> KeyPicture:
     """A picture without features: it stands for one that is not known."""
-    return KeyPicture(np.zeros(3), 1e-3, np.zeros((0, 3)), np.zeros((0, _LENGTHS[0]), np.float32))
+    return KeyPicture(np.zeros(3), np.zeros((0, 3)), np.zeros(0), np.zeros((0, _LENGTHS[0]), np.float32))
 
 
 def matches(first: KeyPicture, second: KeyPicture, ratio: float) -> np.ndarray:

@@ -97,7 +97,7 @@ def epipolar_errors(first: Array, second: Array, yaw: Array, direction: Array) -
 def ransac(
     first: Array,
     second: Array,
-    tolerance_rad: float,
+    tolerance_rad: Array | float,
     samples: int,
     near: tuple[float, float] = (0.0, np.pi),
     seed: int = 0,
@@ -105,6 +105,7 @@ def ransac(
     """The motion (yaw, direction of ``b``) ``(2,)`` on which most pairs of rays ``(n, 3)`` agree.
 
     Args:
+        tolerance_rad: how far the rays of a pair that agrees may miss each other, of all or of each ``(n,)``.
         near: the yaw that is expected, and how far from it the motion's may be (rad).
 
     Returns:

@@ -36,7 +36,7 @@ def points_of(
         if len(pairs) == 0:
             continue
         here, there = pairs.T
-        std_rad = np.full(len(pairs), config.pixel_std * other.pixel_rad)
+        std_rad = _deviations(picture, other, pairs)
         inverse, std = points.inverse.copy(), points.inverse_std.copy()
         inverse[here], std[here] = measured_ranges(points[here], other.rays[there], std_rad, pose, other.centre)
         points = replace(points, inverse=inverse, inverse_std=std)
@@ -54,16 +54,15 @@ def fit(
     pairs = matches(earlier, later, config.ratio)
     if len(pairs) < config.least_inliers:
         return None
-    seen, tolerance = later.rays[pairs[:, 1]], 3.0 * config.pixel_std * later.pixel_rad
-    found = ransac(earlier.rays[pairs[:, 0]], seen, tolerance, config.samples, near)
+    seen, std_rad = later.rays[pairs[:, 1]], _deviations(earlier, later, pairs)
+    found = ransac(earlier.rays[pairs[:, 0]], seen, 3.0 * std_rad, config.samples, near)
     if found is None or found[1].sum() < max(config.least_inliers, config.least_share * len(pairs)):
         return None
     (yaw, direction), agree = found
-    points, seen = points[pairs[agree, 0]], seen[agree]
+    points, seen, std_rad = points[pairs[agree, 0]], seen[agree], std_rad[agree]
     ranged = points.known
     if ranged.sum() < config.least_ranged:
         return None
-    std_rad = np.full(len(seen), config.pixel_std * later.pixel_rad)
     start = _begun(points[ranged], seen[ranged], std_rad[ranged], yaw, direction, later.centre)
     prior = start, np.linalg.inv(_ANYWHERE)
     fitted = fit_view(points, seen, std_rad, later.centre, start, prior, config.scale_std, config.rise_std)
@@ -71,7 +70,15 @@ def fit(
     if inliers < config.least_inliers or fitted.inlier[ranged].mean() < config.ranged_share:
         return None
     floor = np.diag((config.least_m**2, config.least_m**2, config.least_rad**2))
-    return PictureFit(fitted.pose, config.std_factor**2 * fitted.covariance + floor, inliers)
+    covariance = config.std_factor**2 * fitted.covariance + floor
+    if np.linalg.eigvalsh(covariance[:2, :2])[-1] > config.most_m**2 or covariance[2, 2] > config.most_rad**2:
+        return None
+    return PictureFit(fitted.pose, covariance, inliers)
+
+
+def _deviations(first: KeyPicture, second: KeyPicture, pairs: np.ndarray) -> np.ndarray:
+    """Of where matches ``(n, 2)`` are seen against each other ``(n,)``, rad."""
+    return np.hypot(first.std_rad[pairs[:, 0]], second.std_rad[pairs[:, 1]])
 
 
 def _begun(

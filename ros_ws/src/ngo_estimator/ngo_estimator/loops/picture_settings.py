@@ -22,9 +22,8 @@ class PictureLoopConfig:
     apart_m: float = 3.0
     # The second best match must be so many times as far away: a smaller ratio accepts fewer.
     ratio: float = 0.85
-    # Samples of RANSAC, and the error of a match (pixels).
+    # Samples of RANSAC.
     samples: int = 150
-    pixel_std: float = 1.0
     # Fewest matches that agree, and how large a share of all they are.
     least_inliers: int = 18
     least_share: float = 0.35
@@ -36,10 +35,12 @@ class PictureLoopConfig:
     # Deviations that ranges and heights share: of the scale, and of the camera's height (m).
     scale_std: float = 0.05
     rise_std: float = 0.2
-    # Factor on deviations of the fit, and the least ones (m, rad).
+    # Factor on deviations of the fit, the least ones (m, rad), and those beyond which it cannot be told from a wrong one.
     std_factor: float = 3.0
     least_m: float = 0.03
     least_rad: float = 0.006
+    most_m: float = 0.5
+    most_rad: float = 0.08
 
 
 @dataclass(frozen=True)

@@ -184,10 +184,9 @@ class PictureOdometry:
 
     def _key_code(self, grey: Grey) -> np.ndarray:
         self._key_pose = self._odometry.pose.copy()
-        pixels, descriptors = self._describer.describe(grey)
-        most = self._config.features
-        rays = self.model.rays(pixels[:most])
-        return KeyPicture(self.model.centre, self.model.pixel_rad, rays, descriptors[:most]).packed()
+        pixels, std, descriptors = (found[: self._config.features] for found in self._describer.describe(grey))
+        rays, std_rad = self.model.rays(pixels), std * self.model.pixel_rad
+        return KeyPicture(self.model.centre, rays, std_rad, descriptors).packed()
 
 
 def _grey(picture: np.ndarray) -> Grey:
