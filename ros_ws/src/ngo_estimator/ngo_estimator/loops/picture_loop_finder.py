@@ -57,9 +57,7 @@ class PictureLoopFinder:
         """How alike a picture is to each node's ``(n,)``; those that are not compared have -inf."""
         return self._places.alike(picture)
 
-    def fitted(
-        self, node: int, picture: KeyPicture, poses: np.ndarray, near: tuple[float, float]
-    ) -> PictureFit | None:
+    def fitted(self, node: int, picture: KeyPicture, poses: np.ndarray, near: tuple[float, float]) -> PictureFit | None:
         """Where a picture was taken, seen from a node, with poses ``(nodes, 3)`` of all; see ``picture_fit.fit``."""
         return fit(self.config, self._pictures[node], picture, self._points_of(node, poses), near)
 

@@ -35,7 +35,7 @@ class PictureLoopConfig:
     # Deviations that ranges and heights share: of the scale, and of the camera's height (m).
     scale_std: float = 0.05
     rise_std: float = 0.2
-    # Factor on deviations of the fit, the least ones (m, rad), and those beyond which it cannot be told from a wrong one.
+    # Factor on deviations of the fit, the least ones (m, rad), and those beyond which it is no loop.
     std_factor: float = 3.0
     least_m: float = 0.03
     least_rad: float = 0.006

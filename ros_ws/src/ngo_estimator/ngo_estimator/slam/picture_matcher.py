@@ -1,4 +1,4 @@
-"""Sightings by a calibrated camera: a key picture compared with those of a map, as the search for loops verifies one."""
+"""Sightings by a calibrated camera: a key picture compared with those of a map, as a loop is verified."""
 
 import math
 
@@ -63,5 +63,6 @@ class PictureMatcher:
             fitted = finder.fitted(node, self._newest, self._poses, near)
             if fitted is not None:
                 covariance = turned_covariance(pose[2], fitted.covariance)[None]
-                found = found.and_also(Sightings(compose(pose, fitted.relative)[None], covariance, np.array((_BELIEF,))))
+                one = Sightings(compose(pose, fitted.relative)[None], covariance, np.array((_BELIEF,)))
+                found = found.and_also(one)
         return found
