@@ -166,6 +166,18 @@ def test_errors_in_common_do_not_shut_out_the_loops_of_another_place(least_scale
     assert (weights[later > 170] > 0.5).all() == believed and (weights[later <= 170] > 0.5).all()
 
 
+@pytest.mark.parametrize("metric", [True, False])
+def test_a_wrong_loop_that_is_written_often_is_one_witness(metric: bool) -> None:
+    problem, true = square(4, seed=5, metric=metric)
+    right, rows = problem.loops, np.tile(np.arange(0, 2 * ROUND, 2), 20)
+    three_metres_off = np.minimum(right.nodes[rows] + (0, 3), len(true) - 1)
+    loops = right.extended(RelativePoses(three_metres_off, right.relative[rows], right.root[rows]))
+    solution = Robust().correct(replace(problem, loops=loops, trust=np.ones(len(loops))))
+    assert worst(solution.poses, Robust().correct(problem).poses) < 0.1
+    assert solution.loop_weights[len(right) :].mean() < 0.05
+    assert solution.loop_weights[: len(right)].mean() > 0.95
+
+
 def test_a_warm_start_ends_where_a_start_from_nothing_does() -> None:
     """The graph grows, and its loops come in blocks; no verdict of the end differs."""
     problem, _ = square(4, 6, ROUND)

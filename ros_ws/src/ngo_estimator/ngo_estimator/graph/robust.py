@@ -68,8 +68,13 @@ class Robust:
         """Solve a problem; see ``Corrector``.
 
         A warm solution lets new loops in by what the graph predicts of them. Once there are many more loops than at the
-        last solution from nothing, there is one again, and the better one is kept.
+        last solution from nothing, there is one again, and the better one is kept. A loop that is written several
+        times counts once.
         """
+        solution = self._corrected(_with_copies_once(problem), start)
+        return replace(solution, problem=problem, loop_weights=problem.trust * (solution.loop_weights > 0.0))
+
+    def _corrected(self, problem: GraphProblem, start: CorrectedGraph | None) -> CorrectedGraph:
         loops = len(problem.loops)
         if loops == 0:
             chain = chain_poses(problem.steps.relative, problem.poses[0])
@@ -91,6 +96,14 @@ def finished(
     scaled = problem.scaled(scale)
     poses = _looked_again(scaled, poses, map_area(poses), 0.5, told)
     return _polished(problem, poses, scale, len(problem.loops), least_scale)
+
+
+def _with_copies_once(problem: GraphProblem) -> GraphProblem:
+    """The problem in which copies of a loop share its trust: written again, it is no second witness."""
+    loops = problem.loops
+    written = np.concatenate((loops.nodes, loops.relative, loops.root.reshape(len(loops), 9)), axis=1)
+    _, which, copies = np.unique(written, axis=0, return_inverse=True, return_counts=True)
+    return replace(problem, trust=problem.trust / copies[which.ravel()])
 
 
 def _from_nothing(problem: GraphProblem, told: Told, least_scale: float) -> CorrectedGraph:
