@@ -51,12 +51,12 @@ def test_kinds_that_a_command_does_not_measure_stay(tmp_path: Path) -> None:
 def test_a_robot_that_estimates_its_poses_has_a_map_and_says_how_wrong_they_are(tmp_path: Path) -> None:
     folders = {"out": tmp_path, "docs": tmp_path, "runs": tmp_path / "runs"}
     chosen = {"worlds": ("slipping_wheels",), "own_rows": (), "split": "validation", "buildings": 2}
-    main(Arguments(**chosen, scale=0.3, most_s=8.0, **folders))
+    main(Arguments(**chosen, scale=0.3, most_s=12.0, **folders))
     result = json.loads((tmp_path / "explore.json").read_text())
     assert list(result["tables"]["slipping_wheels"]) == ["explore_lite"]
     entry = result["tables"]["slipping_wheels"]["explore_lite"]
     command = result["measured"]["slipping_wheels"]["command"]
-    assert all(part in command for part in (" --scale 0.3 ", " --most-s 8 ", " --split validation"))
+    assert all(part in command for part in (" --scale 0.3 ", " --most-s 12 ", " --split validation"))
     assert 0.0 < entry["ate_m"]["mean"] < 0.05 and entry["within"]["mean"] > 0.9
     assert entry["iou"]["mean"] > 0.1 and entry["path_m"]["mean"] > 0.1
     assert "those of the lidar's estimators" in (tmp_path / "results_explore.md").read_text()

@@ -132,6 +132,15 @@ def test_a_tour_visits_the_near_dead_end_before_it_goes_far() -> None:
     assert order.tolist() == [0, 1, 2] and length == 17.0
 
 
+def test_a_tour_by_worth_goes_to_the_large_room_before_the_near_nook() -> None:
+    places = np.array((1.0, -3.0, -4.0))
+    between = np.abs(places[:, None] - places)
+    order, length = tour(np.abs(places), between)
+    assert order.tolist() == [0, 1, 2] and length == pytest.approx(6.0)
+    order, cost = tour(np.abs(places), between, worth=np.array((0.5, 20.0, 20.0)))
+    assert order.tolist() == [1, 2, 0] and cost == pytest.approx(20.0 * 3.0 + 20.0 * 4.0 + 0.5 * 9.0)
+
+
 def test_a_given_first_place_stays_first() -> None:
     gaps = np.abs(np.arange(5.0)[:, None] - np.arange(5.0)[None])
     order, _ = tour(gaps[0, 1:].copy(), gaps[1:, 1:].copy(), start=2)

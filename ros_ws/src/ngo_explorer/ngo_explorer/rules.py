@@ -10,13 +10,14 @@ import numpy as np
 
 from ngo_explorer.frontiers import Candidate
 from ngo_explorer.known_map import Floats, KnownMap
-from ngo_explorer.planner import cost_field
+from ngo_explorer.planner import cost_field, line_is_free
 from ngo_explorer.settings import ExplorerConfig
 from ngo_explorer.tours import tour
 
 _LOOP_M = 2.0  # a node this near is taken for a loop closure (Placed et al.)
 _NODE_M = 1.0  # between two nodes of a predicted graph
 _MOST_NODES = 150  # of the graph of where the robot was
+_PLACE_M = 2.0  # viewpoints nearer than this are one place of a tour
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,26 +70,41 @@ def _explore_lite(seen: Situation) -> Floats:
 
 
 def _along_a_tour(seen: Situation, config: ExplorerConfig) -> int:
-    """The first of the shortest tour over the nearest frontiers; the present one unless that is clearly longer."""
-    ways = _ways(seen)
-    nearest = np.argsort(ways, kind="stable")[: config.most_in_tour]
-    if seen.present >= 0 and seen.present not in nearest:
-        nearest[-1] = seen.present
-    if len(nearest) == 1:
-        return int(nearest[0])
-    points = np.array([seen.candidates[index].viewpoint_xy for index in nearest])
-    between = _between(seen, points)
-    order, length = tour(ways[nearest], between)
-    if seen.present >= 0 and nearest[order[0]] != seen.present:
-        kept = int(np.flatnonzero(nearest == seen.present)[0])
-        _, present_length = tour(ways[nearest], between, kept)
-        if length > (1.0 - config.switch) * present_length:
+    """The first of the tour that sees unknown area soonest; the present one unless that costs clearly more."""
+    ways, worth = _ways(seen), _places(seen, config.most_in_tour)
+    places, gains = np.array(list(worth)), np.array(list(worth.values()))
+    if len(places) == 1:
+        return int(places[0])
+    between = _between(seen, np.array([seen.candidates[place].viewpoint_xy for place in places]))
+    order, cost = tour(ways[places], between, worth=gains)
+    if seen.present >= 0 and places[order[0]] != seen.present:
+        _, present_cost = tour(ways[places], between, int(np.flatnonzero(places == seen.present)[0]), gains)
+        if cost > (1.0 - config.switch) * present_cost:
             return seen.present
-    return int(nearest[order[0]])
+    return int(places[order[0]])
+
+
+def _places(seen: Situation, most: int) -> dict[int, float]:
+    """The nearest candidates and the largest gain of those that are seen from the same place, the present one first.
+
+    The many frontiers of one room would else be the whole tour, and the next room none of it.
+    """
+    worth: dict[int, float] = {}
+    nearest = np.argsort(_ways(seen), kind="stable").tolist()
+    for index in [seen.present, *nearest] if seen.present >= 0 else nearest:
+        place = next((place for place in worth if _same_place(seen, place, index)), index)
+        if place in worth or len(worth) < most:
+            worth[place] = max(worth.get(place, 0.0), seen.candidates[index].gain_m2)
+    return worth
+
+
+def _same_place(seen: Situation, one: int, other: int) -> bool:
+    begin, end = seen.candidates[one].viewpoint_xy, seen.candidates[other].viewpoint_xy
+    return bool(np.hypot(*(end - begin)) < _PLACE_M) and line_is_free(seen.known, begin, end, seen.need_m)
 
 
 def _between(seen: Situation, points: Floats) -> Floats:
-    """``(n, n)`` costs of the paths between points, the nearest to the robot first, in m."""
+    """``(n, n)`` costs of the paths between points, in m; fastest where the nearest to the robot come first."""
     known, count = seen.known, len(points)
     unit = known.block * known.resolution_m / 10.0
     blocks = np.array([known.cell(point) for point in points]) // known.block

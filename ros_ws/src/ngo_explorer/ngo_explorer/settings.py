@@ -13,7 +13,7 @@ class ExplorerConfig(Settings):
 
     rule: str = setting(
         "tour",
-        "Chooses the next frontier. tour: the first of the shortest tour over the nearest ones; random; nearest: "
+        "Chooses the next frontier. tour: the first of a tour that shows most soonest; random; nearest: "
         "shortest path; explore_lite: 3 x distance - size, as that package; gain_distance: most unknown area a metre; "
         "d_optimality: of the predicted pose graph.",
         choices=RULES,
@@ -25,7 +25,7 @@ class ExplorerConfig(Settings):
     frontier_m: float = setting(0.75, "Length of the smallest frontier, m.", minimum=0.0, maximum=10.0)
     gain_m2: float = setting(0.1, "Unknown area that a frontier must show from its viewpoint, m^2.", minimum=0.0)
     gain_range_m: float = setting(4.0, "Distance beyond a frontier up to which unknown area is gain, m.", minimum=0.3)
-    most_in_tour: int = setting(10, "Frontiers of which a tour is made, the nearest ones.", minimum=1, maximum=100)
+    most_in_tour: int = setting(10, "Places of which a tour is made, the nearest ones.", minimum=1, maximum=100)
     replan_s: float = setting(2.0, "Time between two decisions on the way, s.", minimum=0.1, maximum=600.0)
     switch: float = setting(0.15, "Share by which a new goal must be better than the present one.", minimum=0.0)
     progress_s: float = setting(15.0, "Time without progress after which a goal is put aside, s.", minimum=1.0)

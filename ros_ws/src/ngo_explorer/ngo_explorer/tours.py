@@ -1,4 +1,4 @@
-"""Short tours over frontiers, from the robot to anywhere: nearest insertion, then 2-opt and or-opt."""
+"""Tours over places, from the robot to anywhere, short or soon where it pays: nearest insertion, 2-opt and or-opt."""
 
 from __future__ import annotations
 
@@ -11,15 +11,17 @@ from ngo_explorer.known_map import Floats
 Ints = NDArray[np.int64]
 
 
-def tour(first_m: Floats, between_m: Floats, start: int = -1) -> tuple[Ints, float]:
-    """The order ``(n,)`` in which to visit n places, and its length in m.
+def tour(first_m: Floats, between_m: Floats, start: int = -1, worth: Floats | None = None) -> tuple[Ints, float]:
+    """The order ``(n,)`` in which to visit n places, and what it costs: its length in m.
 
-    first_m: ``(n,)`` ways from the robot. between_m: ``(n, n)`` ways between the places. start: the place to visit
-    first; -1: any.
+    With ``worth`` ``(n,)`` of the places, over 0, the cost is the sum of the ways until each of them by its worth, as
+    of a travelling repairman. first_m: ``(n,)`` ways from the robot. between_m: ``(n, n)`` ways between the places.
+    start: the place to visit first; -1: any.
     """
     order = _inserted(first_m, between_m, start)
-    length = _improved(order, first_m, between_m, 1 if start >= 0 else 0)
-    return order, float(length)
+    worth = np.zeros(len(first_m)) if worth is None else worth
+    cost = _improved(order, first_m, between_m, worth, 1 if start >= 0 else 0)
+    return order, float(cost)
 
 
 @njit(cache=True)
@@ -54,18 +56,20 @@ def _inserted(first: Floats, between: Floats, start: int) -> Ints:
 
 
 @njit(cache=True)
-def _length(order: Ints, first: Floats, between: Floats) -> float:
+def _cost(order: Ints, first: Floats, between: Floats, worth: Floats) -> float:
     way = first[order[0]]
+    total = way * worth[order[0]]
     for index in range(1, len(order)):
         way += between[order[index - 1], order[index]]
-    return way
+        total += way * worth[order[index]]
+    return total if worth.any() else way
 
 
 @njit(cache=True)
-def _improved(order: Ints, first: Floats, between: Floats, fixed: int) -> float:
-    """Reverse and move parts of the tour while that makes it shorter; the first ``fixed`` places stay."""
+def _improved(order: Ints, first: Floats, between: Floats, worth: Floats, fixed: int) -> float:
+    """Reverse and move parts of the tour while that makes it cheaper; the first ``fixed`` places stay."""
     count = len(order)
-    best = _length(order, first, between)
+    best = _cost(order, first, between, worth)
     changed = True
     rounds = 0
     while changed and rounds < 50:
@@ -75,10 +79,10 @@ def _improved(order: Ints, first: Floats, between: Floats, fixed: int) -> float:
             for end in range(begin + 1, count):
                 tried = order.copy()
                 tried[begin : end + 1] = order[begin : end + 1][::-1]
-                length = _length(tried, first, between)
-                if length < best - 1e-9:
+                cost = _cost(tried, first, between, worth)
+                if cost < best - 1e-9:
                     order[:] = tried
-                    best, changed = length, True
+                    best, changed = cost, True
         for size in range(1, min(4, count - fixed)):
             for begin in range(fixed, count - size + 1):
                 for target in range(fixed, count - size + 1):
@@ -87,8 +91,8 @@ def _improved(order: Ints, first: Floats, between: Floats, fixed: int) -> float:
                     part = order[begin : begin + size].copy()
                     rest = np.concatenate((order[:begin], order[begin + size :]))
                     tried = np.concatenate((rest[:target], part, rest[target:]))
-                    length = _length(tried, first, between)
-                    if length < best - 1e-9:
+                    cost = _cost(tried, first, between, worth)
+                    if cost < best - 1e-9:
                         order[:] = tried
-                        best, changed = length, True
+                        best, changed = cost, True
     return best
