@@ -32,11 +32,12 @@ def test_rooms_that_look_alike_are_noticed_and_corners_of_a_ring_are_told_apart(
     assert not matcher_of(HALLWAY, way(*ROUND, ROUND[0])).has_alike_places()
 
 
-def test_a_way_confirms_its_place_by_the_walls_that_it_has_in_common_with_the_map() -> None:
+def test_a_way_is_clear_at_its_place_by_the_walls_that_it_has_in_common_with_the_map() -> None:
     matcher, again = matcher_of(HALLWAY, way(*ROUND, ROUND[0])), way(*ROUND)[:40]
     random = np.random.default_rng(1)
     odometry = np.array([between(again[0], pose) for pose in again])
     for step in lidar_steps(odometry, lambda k, stamp_ns: scan_at(HALLWAY, again[k], random)):
         matcher.append(step, step.odom_xyyaw)
-    assert matcher.confirms(again[-1]) is True
-    assert not matcher.confirms(again[-1] + (2.0, 0.0, 0.0)) and not matcher.confirms(again[-1] + (0.0, 0.0, np.pi))
+    place, aside, turned = again[-1], again[-1] + (2.0, 0.0, 0.0), again[-1] + (0.0, 0.0, np.pi)
+    assert matcher.is_clear(place)
+    assert not any(matcher.is_clear(pose) or matcher.allows(pose) for pose in (aside, turned))

@@ -22,13 +22,15 @@ class Map:
     """A map that sees the robot where it truly is, and also where ``copies`` (n, 3) of the map say."""
 
     place_m = 1.0
+    look_m = 0.4
     search_every = 1
 
     def __init__(self, copies: tuple[tuple[float, float, float], ...] = ((0.0, 0.0, 0.0),), seed: int = 0) -> None:
         self.copies, self.pose, self.blind = [np.array(copy) for copy in copies], np.zeros(3), False
         self._random = np.random.default_rng(seed)
         self.asked = 0
-        self.confirmed: bool | None = None
+        self.clear: list[np.ndarray] = []  # of the copies
+        self.allowing = True
 
     def append(self, step: RelativeStep, odometry: np.ndarray) -> bool:
         return True
@@ -47,8 +49,11 @@ class Map:
     def around(self, expected: np.ndarray) -> Sightings:
         return Sightings.none()
 
-    def confirms(self, pose: np.ndarray) -> bool | None:
-        return self.confirmed
+    def is_clear(self, pose: np.ndarray) -> bool:
+        return any(math.dist(pose[:2], compose(copy, self.pose)[:2]) < 0.5 for copy in self.clear)
+
+    def allows(self, pose: np.ndarray) -> bool:
+        return self.allowing
 
 
 class Anywhere(Map):
@@ -92,15 +97,26 @@ def test_a_start_in_the_middle_of_the_map_is_found_and_followed() -> None:
     assert np.sqrt(found[-1].covariance[0, 0]) < 0.05
 
 
-def test_a_matcher_that_confirms_a_pose_makes_few_looks_enough_and_one_that_does_not_forbids_a_claim() -> None:
+def test_few_looks_are_enough_where_the_way_is_clear_and_none_where_places_look_alike() -> None:
     first = {}
-    for confirmed in (True, None):
+    for clear in (True, False):
         at = Map()
-        at.confirmed = confirmed
-        first[confirmed] = [one.claimed for one in drive(Localiser(at), at, 40)].index(True)
-    assert first[True] < 10 < first[None] < 20
+        at.clear = at.copies if clear else []
+        first[clear] = [one.claimed for one in drive(Localiser(at), at, 40)].index(True)
+    assert first[True] < 7 < first[False] < 20
     at = Map()
-    at.confirmed = False
+    at.allowing = False
+    assert not any(one.claimed for one in drive(Localiser(at), at, 60))
+
+
+@pytest.mark.parametrize("clear", [0, 1])
+def test_of_two_places_the_one_where_the_way_is_clear_is_claimed(clear: int) -> None:
+    at = Map(((0.0, 0.0, 0.0), (8.0, 1.0, 0.0)))
+    at.clear = at.copies[clear : clear + 1]
+    found = next(one for one in drive(Localiser(at), at, 40) if one.claimed)
+    assert found.pose_xyyaw is not None
+    np.testing.assert_allclose(found.pose_xyyaw[:2], compose(at.copies[clear], at.pose)[:2], atol=0.2)
+    at.clear = at.copies
     assert not any(one.claimed for one in drive(Localiser(at), at, 60))
 
 

@@ -2,7 +2,8 @@
 
 A frame is compared with the map wherever the robot has moved enough. Over a rolling window of such frames hypotheses
 of the newest pose are put together by odometry. A pose is claimed where hypotheses of several frames agree, and no
-other pose has nearly as many. From then on a filter fuses odometry with the sightings that agree with it.
+other pose has nearly as many. A few are enough where the matcher finds the way clear there, and nowhere else. From then
+on a filter fuses odometry with the sightings that agree with it.
 """
 
 from __future__ import annotations
@@ -38,10 +39,8 @@ _STRONG = 0.8
 class LocalisationConfig:
     """When a pose is claimed, and when it is lost again. A place has the length of the matcher's ``place_m``."""
 
-    look_places: float = 0.4
-    """Motion after which the map is looked at (places)."""
     look_deg: float = 10.0
-    """Turn after which it is looked at (degrees)."""
+    """Turn after which the map is looked at, also without the matcher's motion (degrees)."""
     window: int = 24
     """Last looks that count."""
     least_support: float = 7.0
@@ -51,8 +50,8 @@ class LocalisationConfig:
     least_way_places: float = 3.0
     """Path over which the support must be spread (places)."""
     sure_support: float = 3.0
-    """Looks that are enough where the matcher confirms a pose."""
-    sure_way_places: float = 1.0
+    """Looks that are enough where the matcher finds a pose clear."""
+    sure_way_places: float = 0.5
     """Path that is enough then (places)."""
     most_rival: float = 0.35
     """Support of another pose at most, as a share of the claim's, 0 to below 1."""
@@ -60,7 +59,7 @@ class LocalisationConfig:
     """Deviation of the position past which a pose is lost (places)."""
 
     def __post_init__(self) -> None:
-        names = ("look_places", "look_deg", "least_support", "sure_support", "lost_places")
+        names = ("look_deg", "least_support", "sure_support", "lost_places")
         if not all(0.0 < getattr(self, name) < math.inf for name in names):
             raise ValueError(f"{', '.join(names)} are {[getattr(self, n) for n in names]}; expected positive numbers")
         if self.window < 2:
@@ -97,7 +96,7 @@ class Localiser:
 
     def __init__(self, matcher: MapMatcher, config: LocalisationConfig | None = None) -> None:
         self.config = config = config or LocalisationConfig()
-        # What confirms a pose has asked all frames, and not only those with sightings.
+        # A way that is clear has asked all frames, and not only those with sightings.
         self._sure = replace(
             config, least_support=config.sure_support, least_way_places=config.sure_way_places, least_share=0.0
         )
@@ -126,9 +125,8 @@ class Localiser:
         known = self._track is not None
         self._move(relative, covariance)
         usable = self._matcher.append(step, self._odometry)
-        config = self.config
-        due = self._way_m >= config.look_places * self._matcher.place_m
-        if usable and (due or self._turn_rad >= math.radians(config.look_deg)):
+        due = self._way_m >= self._matcher.look_m or self._turn_rad >= math.radians(self.config.look_deg)
+        if usable and due:
             self._look()
         found = self._track is not None
         pose, covariance_now = (None, None) if self._track is None else self._track
@@ -156,8 +154,7 @@ class Localiser:
         hypotheses, place_m = self._window.hypotheses(), self._matcher.place_m
         self._modes = strongest_modes(hypotheses, place_m)
         if self._track is None:
-            if self._modes and self._may_claim(self._modes[0], self._modes[1:]):
-                mode = self._modes[0]
+            if (mode := self._beyond_doubt()) is not None:
                 agree = agreeing(hypotheses, mode.pose_xyyaw, mode.covariance, place_m)
                 self._track = fused(hypotheses.where(agree), mode.pose_xyyaw)
             return
@@ -177,12 +174,15 @@ class Localiser:
         if len(seen.look):
             self._track = fused(seen, *self._track)
 
-    def _may_claim(self, mode: Mode, others: Sequence[Mode]) -> bool:
-        enough = self._supported(self.config, mode, others)
-        if not (enough or self._supported(self._sure, mode, others)):
-            return False
-        confirmed = self._matcher.confirms(mode.pose_xyyaw)
-        return enough if confirmed is None else confirmed
+    def _beyond_doubt(self) -> Mode | None:
+        """The mode that may be claimed: the only one where the way is clear, or one with many sightings."""
+        matcher = self._matcher
+        few = [mode for mode in self._modes if self._supported(self._sure, mode, ())]
+        clear = [mode for mode in few if matcher.is_clear(mode.pose_xyyaw)]
+        if len(clear) == 1:
+            return clear[0]
+        many = [mode for mode in few[:1] if self._supported(self.config, mode, self._modes[1:])]
+        return next((mode for mode in many if matcher.allows(mode.pose_xyyaw)), None)
 
     def _supported(self, config: LocalisationConfig, mode: Mode, others: Sequence[Mode]) -> bool:
         return may_claim(config, self._window, mode, others, self._matcher.place_m, len(self._window))

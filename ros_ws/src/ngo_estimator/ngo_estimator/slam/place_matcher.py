@@ -28,6 +28,7 @@ from ngo_estimator.networks.place_encoder import PairHead
 from ngo_estimator.ngo.loop_gates import RobustLoopGate
 from ngo_estimator.slam.sightings import Sightings
 
+_LOOK_PLACES = 0.4  # motion between frames that are compared (places)
 _KEPT = 16  # frames: views reach back that far and less
 _LOOKED_AT = 256  # most similar frames of the map, among which places are distinguished
 _NEAR = 64  # frames around the expected pose whose ranges are compared
@@ -50,6 +51,7 @@ class PlaceMatcher:
             )
         self.search_every = 1
         self.place_m = pair_head.config.offset_scale_m
+        self.look_m = _LOOK_PLACES * self.place_m
         self._pair_head, self._search, self._candidates = pair_head, search, candidates
         self._poses = torch.from_numpy(places.poses.astype(np.float64))
         self._map_codes = torch.from_numpy(np.asarray(places.codes, np.float32))
@@ -83,8 +85,13 @@ class PlaceMatcher:
         there = torch.from_numpy(expected)
         return self._by_places(self._nearby(self._similarity(), there)).and_also(self._by_overlaps(there))
 
-    def confirms(self, pose: np.ndarray) -> None:
+    def is_clear(self, pose: np.ndarray) -> bool:
         """Nothing is known of frames but their place codes."""
+        return False
+
+    def allows(self, pose: np.ndarray) -> bool:
+        """Nothing is known of frames but their place codes."""
+        return True
 
     def _similarity(self) -> Tensor:
         newest = torch.from_numpy(self._codes.slice(len(self._codes) - 1))

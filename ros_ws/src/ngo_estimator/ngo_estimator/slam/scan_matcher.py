@@ -60,7 +60,8 @@ class ScanMatcher:
     """
 
     place_m = 1.0
-    search_every = 4
+    look_m = 0.0  # key scans alone are compared, which are apart
+    search_every = 8
 
     def __init__(
         self,
@@ -109,7 +110,7 @@ class ScanMatcher:
         self._recent = [*self._recent, step.key.scan][-_MOST_RECENT:]
         self._profiles = [*self._profiles, range_profile(step.key.scan)][-_MOST_RECENT:]
         self._odometry = [*self._odometry, odometry][-_MOST_RECENT:]
-        return len(self._recent) >= self._config.source_keys
+        return True
 
     def everywhere(self) -> Sightings:
         """Hypotheses of the newest frame's pose, wherever it may be: the best one, and the best well apart from it."""
@@ -131,17 +132,17 @@ class ScanMatcher:
         """Hypotheses of the newest frame's pose, which should be near ``expected`` ``(3,)``."""
         return self._verified(self._source(), (expected,))
 
-    def confirms(self, pose: np.ndarray) -> bool | None:
-        """Whether the newest frame is at a pose, beside what sightings say: by the walls that its way and the map have.
+    def is_clear(self, pose: np.ndarray) -> bool:
+        """Whether few sightings are enough for a pose: by the walls that the way and the map have in common there."""
+        return self._evidence(pose).is_clear
 
-        Where these are few, sightings may be of another place that looks the same, if there are such places.
-        """
-        if self._evidence(pose).is_clear:
-            return True
+    def allows(self, pose: np.ndarray) -> bool:
+        """Whether many sightings are enough: the way and the map agree there, and places around do not look alike."""
+        if not self._evidence(pose).suffices:
+            return False
         there = int(np.linalg.norm(self._poses[:, :2] - pose[:2], axis=1).argmin())
         half = WAY_KEYS // 2
-        first = max(0, min(there // half * half - half // 2, len(self._scans) - WAY_KEYS))
-        return False if self._is_ambiguous(first) else None
+        return not self._is_ambiguous(max(0, min(there // half * half - half // 2, len(self._scans) - WAY_KEYS)))
 
     def _is_ambiguous(self, first: int) -> bool:
         """Whether places look alike among the key scans from ``first`` on, to a robot that has seen as much."""

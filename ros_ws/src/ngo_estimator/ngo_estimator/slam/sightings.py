@@ -48,6 +48,8 @@ class MapMatcher(Protocol):
 
     place_m: float
     """Distance of two frames that show one place."""
+    look_m: float
+    """Motion after which it is worth comparing another frame."""
     search_every: int
     """Where the pose is known, the whole map is asked at every so many looks: it may cost a lot."""
 
@@ -60,11 +62,11 @@ class MapMatcher(Protocol):
     def around(self, expected: np.ndarray) -> Sightings:
         """Hypotheses of the newest frame's pose, which should be near ``expected`` ``(3,)``."""
 
-    def confirms(self, pose: np.ndarray) -> bool | None:
-        """Whether the newest frame is at a pose ``(3,)`` that sightings agree on, by what else is known.
+    def is_clear(self, pose: np.ndarray) -> bool:
+        """Whether few sightings are enough for a pose ``(3,)``, by what else is known of the way and the map."""
 
-        True: fewer sightings are enough. False: no number of them is. None: nothing else is known.
-        """
+    def allows(self, pose: np.ndarray) -> bool:
+        """Whether many sightings are enough for a pose ``(3,)``; else no number of them is."""
 
     def reset(self) -> None:
         """Forget all frames but those of the map."""
