@@ -39,9 +39,10 @@ _LEAST_WALLS, _MOST_MEAN, MOST_THROUGH = 8, 0.15, 0.33
 """A claim needs so many different walls. The way may look through so much of the walls in the mean, and each of its
 parts through so much at most."""
 
-_CLEAR_MEAN, _FEWEST_WALLS = 0.07, 4
-"""A way that was just driven looks through so much of the walls of a good map at most: doors, people and furniture. The
-less it does, the fewer walls tell places apart: so few where it looks through none."""
+_CLEAR_MEAN, _CLEAR_THROUGH, _FEWEST_WALLS = 0.07, 0.15, 4
+"""A way that was just driven looks through so much of the walls of a good map at most in the mean, and so much in each
+part: doors, people and furniture. The less it does, the fewer walls tell places apart: so few where it looks through
+none."""
 
 
 @dataclass(frozen=True)
@@ -70,7 +71,7 @@ class PlaceEvidence:
     def is_clear(self) -> bool:
         """Whether they do not even contradict each other as little as a map may that is still being made."""
         needed = _FEWEST_WALLS + (_LEAST_WALLS - _FEWEST_WALLS) * self.mean / _CLEAR_MEAN
-        return bool(self.walls >= needed and self.mean <= _CLEAR_MEAN and self.through <= MOST_THROUGH)
+        return bool(self.walls >= needed and self.mean <= _CLEAR_MEAN and self.through <= _CLEAR_THROUGH)
 
 
 NO_EVIDENCE = PlaceEvidence(0, 0.0, 0)
