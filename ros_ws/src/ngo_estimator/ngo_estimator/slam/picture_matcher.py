@@ -8,7 +8,7 @@ from ngo_estimator.data.relative_step import RelativeStep
 from ngo_estimator.geometry.key_picture import KeyPicture
 from ngo_estimator.geometry.planar_motion import compose, turned_covariance, wrap
 from ngo_estimator.loops.picture_loop_finder import PictureLoopFinder
-from ngo_estimator.slam.sightings import Sightings
+from ngo_estimator.slam.sightings import Sightings, SightingsAlone
 
 _BELIEF = 0.9
 """In a fit that geometry verified: another place may look alike."""
@@ -17,7 +17,7 @@ _TURN_RAD = 0.3
 """By which the newest picture may be turned against what is expected."""
 
 
-class PictureMatcher:
+class PictureMatcher(SightingsAlone):
     """Compares key pictures with those of a map.
 
     Args:
@@ -26,7 +26,7 @@ class PictureMatcher:
     """
 
     def __init__(self, finder: PictureLoopFinder, poses: np.ndarray) -> None:
-        self.search_every, self.place_m = 1, 2.0
+        self.search_every, self.place_m, self.look_m = 1, 2.0, 0.8
         self._finder, self._poses = finder, poses
         self.reset()
 
@@ -47,9 +47,6 @@ class PictureMatcher:
         """Hypotheses of the newest frame's pose, which should be near ``expected`` ``(3,)``."""
         away = np.linalg.norm(self._poses[:, :2] - expected[:2], axis=1)
         return self._seen_from(np.flatnonzero(away < self._finder.config.apart_m), float(expected[2]))
-
-    def confirms(self, pose: np.ndarray) -> None:
-        """Nothing else is known than what pictures look like."""
 
     def _seen_from(self, nodes: np.ndarray, yaw: float | None) -> Sightings:
         """What the key pictures that look most alike among ``nodes`` say; ``yaw`` is the newest one's, where known."""

@@ -26,7 +26,7 @@ from ngo_estimator.loops.pair_measurement import (
 from ngo_estimator.loops.place_map import PlaceMap
 from ngo_estimator.networks.place_encoder import PairHead
 from ngo_estimator.ngo.loop_gates import RobustLoopGate
-from ngo_estimator.slam.sightings import Sightings
+from ngo_estimator.slam.sightings import Sightings, SightingsAlone
 
 _LOOK_PLACES = 0.4  # motion between frames that are compared (places)
 _KEPT = 16  # frames: views reach back that far and less
@@ -36,7 +36,7 @@ _APART_RAD = 0.5  # two frames that are turned so much from each other are two c
 _FLOOR_M, _FLOOR_RAD = 1e-3, 1e-4  # of a sighting's deviations: the map is no better
 
 
-class PlaceMatcher:
+class PlaceMatcher(SightingsAlone):
     """Compares frames by their place codes with those of a map.
 
     Args:
@@ -84,14 +84,6 @@ class PlaceMatcher:
         """Hypotheses of the newest frame's pose, which should be near ``expected`` ``(3,)``."""
         there = torch.from_numpy(expected)
         return self._by_places(self._nearby(self._similarity(), there)).and_also(self._by_overlaps(there))
-
-    def is_clear(self, pose: np.ndarray) -> bool:
-        """Nothing is known of frames but their place codes."""
-        return False
-
-    def allows(self, pose: np.ndarray) -> bool:
-        """Nothing is known of frames but their place codes."""
-        return True
 
     def _similarity(self) -> Tensor:
         newest = torch.from_numpy(self._codes.slice(len(self._codes) - 1))

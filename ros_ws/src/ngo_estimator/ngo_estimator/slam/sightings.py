@@ -70,3 +70,15 @@ class MapMatcher(Protocol):
 
     def reset(self) -> None:
         """Forget all frames but those of the map."""
+
+
+class SightingsAlone:
+    """The part of a ``MapMatcher`` that knows nothing of a pose but its sightings."""
+
+    def is_clear(self, pose: np.ndarray) -> bool:
+        """Few sightings are never enough."""
+        return False
+
+    def allows(self, pose: np.ndarray) -> bool:
+        """Many sightings are enough."""
+        return True
