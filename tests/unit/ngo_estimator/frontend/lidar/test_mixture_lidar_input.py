@@ -217,6 +217,15 @@ def test_wheels_that_slip_so_fast_that_a_scan_fits_nowhere(slip_deg: float) -> N
     assert np.hypot(errors[:, 0], errors[:, 1]).max() < 0.1
 
 
+@pytest.mark.parametrize("step_m", [0.003, 0.01, 0.05])
+def test_wheels_that_stand_do_not_hold_a_robot_that_drives(step_m: float) -> None:
+    poses = np.array([compose(way(1)[0], np.array((max(0, k - 10) * step_m, 0.0, 0.0))) for k in range(70)])
+    stood = wheels(np.tile(poses[0], (70, 1)))
+    found = fed(MixtureLidar(), [record for pair in zip(stood, scans(poses), strict=True) for record in pair])
+    errors = [between(between(poses[0], p), step.odom_xyyaw) for p, step in zip(poses[1:], found, strict=True)]
+    assert np.abs(errors).max() < 0.02
+
+
 def hostile_scans() -> dict[str, LidarScan]:
     count = 20_000
     good = cast(ROOM, way(20)[10], ANGLES)
