@@ -29,7 +29,7 @@ that is not solved there has a cheaper wrong solution: no search for a lower cos
 | local | between nodes near each other along the chain |
 | grouped | in groups of ten that agree with each other |
 | lookalike | between stretches of fifty nodes that look alike |
-| offset | right ones, shifted by 3 m, all in the same way |
+| offset | right ones, shifted by 3 m, all in the same way, drawn with replacement: at 70 % each is there 2.6 times |
 """
 
 
