@@ -3,6 +3,7 @@
     python -m training.results --world camera --split validation
     python -m training.results --world camera
     python -m training.results --world camera --named take_cover MAP27
+    python -m training.results --world camera --split validation --without corrector
 
 Drives that ``camera.json`` has of the same revision and settings are not measured again.
 
@@ -24,10 +25,13 @@ from ngo_estimator.frontend.camera.camera_config import CameraConfig
 from ngo_estimator.frontend.camera.picture_odometry import PictureOdometry
 from ngo_estimator.geometry import se2
 from ngo_estimator.geometry.camera_model import CameraModel, tilted
+from ngo_estimator.graph.corrector import CorrectedGraph, GraphProblem
 from ngo_estimator.loops.picture_settings import PictureGraphConfig
+from ngo_estimator.slam.picture_back_end import PictureBackEnd
 from ngo_estimator.slam.picture_trajectory import PictureTrajectory
 from ngo_sim.episodes import record_episode
 from ngo_sim.maze3d import Maze3D, Maze3DConfig
+from training.baselines.graph_peers import least_squares
 from training.common import records
 from training.common.command_line import check_at_least, run_command
 from training.data.doom_drives import TEST_MAPS, VALIDATION_MAPS, Map
@@ -51,6 +55,7 @@ class Arguments:
     seeds: int = 1  # Drives of each map.
     frames: int = 1000  # Frames of a drive.
     maps: int = 0  # Number of maps; 0: all.
+    without: Literal["nothing", "tracks", "sift", "corrector"] = "nothing"  # An ablation, in a file of its own.
     named: tuple[str, ...] = ()  # Words of which one is in the name of each map to measure, as take_cover; none: all.
     results: Path = Path("training/results")  # Folder of camera.json.
 
@@ -107,9 +112,46 @@ def given_motion(truth: np.ndarray, seed: int) -> np.ndarray:
     return poses
 
 
-def measured(of: Drive, given: np.ndarray) -> dict[str, float]:
+class _Orb:
+    """A ``Describer``: ORB (Rublee et al. 2011), each bit a number."""
+
+    def __init__(self, most: int) -> None:
+        self._orb = cv2.ORB.create(nfeatures=most)
+
+    def describe(self, grey: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        found, codes = self._orb.detectAndCompute(grey, None)
+        if codes is None:
+            return np.zeros((0, 2)), np.zeros(0), np.zeros((0, 256), np.float32)
+        bits = np.unpackbits(codes, axis=1).astype(np.float32)
+        std = 0.5 * 1.2 ** np.array([point.octave for point in found])  # pixels of its level of the pyramid
+        return np.array([point.pt for point in found]), std, (bits - 0.5) / 8.0
+
+
+class _Believes:
+    """A ``Corrector`` that believes all loops."""
+
+    def correct(self, problem: GraphProblem, start: CorrectedGraph | None = None) -> CorrectedGraph:
+        ones = (np.ones(len(edges)) for edges in (problem.loops, problem.steps))
+        return CorrectedGraph(problem, least_squares(problem), *ones, 0.0)
+
+
+class _BelievingTrajectory(PictureTrajectory):
+    def _new_back_end(self) -> PictureBackEnd:
+        back_end = super()._new_back_end()
+        back_end._corrector = _Believes()
+        return back_end
+
+
+def estimators(camera: CameraModel, without: str) -> tuple[PictureOdometry, PictureTrajectory]:
+    """Both estimators, without their tracked corners, SIFT (ORB stands for it) or the robust corrector."""
+    config = CameraConfig(least_inliers=CameraConfig.corners + 1) if without == "tracks" else CameraConfig()
+    odometry = PictureOdometry(camera, config, _Orb(config.features) if without == "sift" else None)
+    return odometry, _BelievingTrajectory() if without == "corrector" else PictureTrajectory()
+
+
+def measured(of: Drive, given: np.ndarray, without: str = "nothing") -> dict[str, float]:
     """All numbers of one drive."""
-    odometry, graph = PictureOdometry(of.camera), PictureTrajectory()
+    odometry, graph = estimators(of.camera, without)
     published, covariances = [], []
     began = time.process_time()  # of one thread, whatever else runs on the machine
     for frame, picture in enumerate(of.pictures):
@@ -159,7 +201,9 @@ def main(arguments: Arguments) -> dict[str, Any]:
         "graph": asdict(PictureGraphConfig()),
         "drives": {},
     }
-    path = arguments.results / ("camera.json" if arguments.split == "test" else "camera.validation.json")
+    named = {"test": "", "nothing": ""}
+    parts = [named.get(part, f".{part}") for part in (arguments.split, arguments.without)]
+    path = arguments.results / f"camera{parts[0]}{parts[1].replace('.', '.no_')}.json"
     result["drives"] = _measured_before(path, result)
     first = _FIRST_SEED[arguments.split]
     for number, of in enumerate(_MAPS[arguments.split][: arguments.maps or None]):
@@ -168,7 +212,7 @@ def main(arguments: Arguments) -> dict[str, Any]:
             if title in result["drives"] or not any(word in title for word in arguments.named or ("",)):
                 continue
             one = drive(of, seed, arguments.frames)
-            result["drives"][title] = measured(one, given_motion(one.truth, seed + 100 * number))
+            result["drives"][title] = measured(one, given_motion(one.truth, seed + 100 * number), arguments.without)
             print(_line(title, result["drives"][title]), flush=True)
             _write(path, result)
     _write(path, result)

@@ -11,6 +11,16 @@ from training import results_camera
 pytestmark = pytest.mark.slow
 
 
+@pytest.mark.parametrize("without", ["tracks", "sift", "corrector"])
+def test_an_ablation_has_a_file_of_its_own(without: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(results_camera._MAPS, "test", (("take_cover.wad", "MAP01"),))
+    (drive,) = results_camera.main(
+        results_camera.Arguments(frames=24, without=without, results=tmp_path)  # type: ignore[arg-type]
+    )["drives"].values()
+    assert [path.name for path in tmp_path.iterdir()] == [f"camera.no_{without}.json"]
+    assert (drive["odometry_ate_m"] == pytest.approx(drive["given_ate_m"])) == (without == "tracks")
+
+
 def test_a_short_drive_on_a_map(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(results_camera._MAPS, "test", (("take_cover.wad", "MAP01"),))
     arguments = results_camera.Arguments(frames=24, seeds=2, results=tmp_path)
