@@ -15,13 +15,16 @@ from ngo_estimator.graph.robust import Robust
 from ngo_estimator.loops.picture_loop_finder import PictureLoopFinder
 from ngo_estimator.loops.picture_settings import PictureGraphConfig
 from ngo_estimator.slam.back_end import BackEnd, ClosedLoops, require_sound
-from ngo_estimator.slam.localisation import Localiser
+from ngo_estimator.slam.localisation import LocalisationConfig, Localiser
 from ngo_estimator.slam.map_origin import MapOrigin
 from ngo_estimator.slam.picture_matcher import PictureMatcher
 from ngo_estimator.slam.step_log import TakenStep
 
 _KEYS_PER_OPTIMISED = 20
 """For each so many nodes an optimisation waits for one more key picture."""
+
+_LEAST_SHARE = 0.3
+"""Of the looks that must support a claimed pose: where no key picture looked the same way, a look tells nothing."""
 
 
 class PictureBackEnd(BackEnd):
@@ -130,7 +133,8 @@ class PictureBackEnd(BackEnd):
 
     def localiser(self, origin: MapOrigin) -> Localiser:
         """Localises in the key pictures as they are."""
-        return Localiser(PictureMatcher(self._finder, origin.poses(self.graph.poses.copy())))
+        matcher = PictureMatcher(self._finder, origin.poses(self.graph.poses.copy()))
+        return Localiser(matcher, LocalisationConfig(least_share=_LEAST_SHARE))
 
     SAVED = ("graph", "_finder", "_waiting", "closed", "_loops_from_nothing", "_scale")
 
