@@ -120,9 +120,9 @@ class _Orb:
 
     def describe(self, grey: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         found, codes = self._orb.detectAndCompute(grey, None)
-        if codes is None:
+        if len(found) == 0:
             return np.zeros((0, 2)), np.zeros(0), np.zeros((0, 256), np.float32)
-        bits = np.unpackbits(codes, axis=1).astype(np.float32)
+        bits = np.unpackbits(np.asarray(codes, np.uint8), axis=1).astype(np.float32)
         std = 0.5 * 1.2 ** np.array([point.octave for point in found])  # pixels of its level of the pyramid
         return np.array([point.pt for point in found]), std, (bits - 0.5) / 8.0
 
@@ -131,8 +131,8 @@ class _Believes:
     """A ``Corrector`` that believes all loops."""
 
     def correct(self, problem: GraphProblem, start: CorrectedGraph | None = None) -> CorrectedGraph:
-        ones = (np.ones(len(edges)) for edges in (problem.loops, problem.steps))
-        return CorrectedGraph(problem, least_squares(problem), *ones, 0.0)
+        loops, steps = np.ones(len(problem.loops)), np.ones(len(problem.steps))
+        return CorrectedGraph(problem, least_squares(problem), loops, steps, 0.0)
 
 
 class _BelievingTrajectory(PictureTrajectory):
