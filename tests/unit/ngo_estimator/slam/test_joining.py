@@ -147,6 +147,7 @@ def test_a_session_goes_on_from_another_start_in_one_map(
     assert np.hypot(*(update.pose_xyyaw - truth[n])[:2]) < most_claim_m
     # A drive that is found at its first scans is as far off as the map, over its whole way.
     alone = rmse(before.poses_xyyaw, np.array([between(start, pose) for pose in first.truth[: len(before.stamps_ns)]]))
+    assert alone < most_m
     bar_m = max(most_m, 1.25 * alone)
     assert max(rmse(trajectory.poses_xyyaw[:n], truth[:n]), rmse(trajectory.poses_xyyaw[n:], truth[n:])) < bar_m
     across = (trajectory.loops[:, 0] < n) & (trajectory.loops[:, 1] >= n) & (trajectory.loop_weights > 0.5)
@@ -196,7 +197,7 @@ def test_a_told_pose_joins_at_the_next_key_scan() -> None:
     assert [update is not None for update in updates] == [k >= at for k in range(20)]
     update = updates[at]
     expected = compose(own, steps[at].odom_xyyaw)
-    # What the first key scan sees of the map counts, too.
+    # What the first key scan sees of the map counts, too: it moves the pose within what was said of it.
     assert update is not None
     assert (np.abs(between(expected, update.pose_xyyaw)) < 3.0 * np.array((0.05, 0.05, 0.02))).all()
 

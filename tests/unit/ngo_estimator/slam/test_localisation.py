@@ -120,6 +120,15 @@ def test_of_two_places_the_one_where_the_way_is_clear_is_claimed(clear: int) -> 
     assert not any(one.claimed for one in drive(Localiser(at), at, 60))
 
 
+def test_a_clear_way_at_a_place_with_fewer_sightings_than_another_is_no_claim() -> None:
+    at = Map(((0.0, 0.0, 0.0),))
+    localiser = Localiser(at)
+    list(drive(localiser, at, 6))  # sees one place alone
+    at.copies.append(np.array((8.0, 1.0, 0.0)))
+    at.clear = at.copies[1:]
+    assert not any(one.claimed for one in drive(localiser, at, 8))
+
+
 @pytest.mark.parametrize("copy", [(8.0, 1.0, 0.0), (0.0, 0.0, math.pi), (3.0, 0.0, math.pi / 2.0)])
 def test_an_ambiguous_map_is_never_claimed(copy: tuple[float, float, float]) -> None:
     at = Map(((0.0, 0.0, 0.0), copy))

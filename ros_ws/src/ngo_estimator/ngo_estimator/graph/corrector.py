@@ -66,7 +66,7 @@ class GraphProblem:
 
 @dataclass(frozen=True)
 class CorrectedGraph:
-    """A solution of a ``GraphProblem``.
+    """A solution of a ``GraphProblem``, in which copies of a loop may share their trust.
 
     ``poses`` ``(nodes, 3)``. ``loop_weights`` ``(loops,)`` and ``step_weights`` ``(nodes - 1,)``, zero to one, say how
     much each edge is believed. ``cost`` is the truncated cost with variances ``scale`` times as large as stated, as
@@ -94,7 +94,7 @@ class CorrectedGraph:
         return normal_equations(
             self.poses,
             (self.problem.steps, self.step_weights / self.step_scale),
-            (self.problem.loops[believed], self.loop_weights[believed] / self.loop_scale),
+            (self.problem.loops[believed], self.problem.trust[believed] / self.loop_scale),
         ).covariance(nodes)
 
 

@@ -47,8 +47,9 @@ class CrowdAware:
         best = robust.correct(problem, start)
         if len(problem.loops) == 0 or best.loops_from_nothing < len(problem.loops):
             return best
-        fair = without_crowds(problem.scaled(best.scale))
+        once = best.problem  # copies share their trust
+        fair = without_crowds(once.scaled(best.scale))
         begun = robust.correct(without_crowds(problem)).poses
-        found = finished(problem, begun, best.scale, self._told, self._least_scale)
+        found = finished(once, begun, best.scale, self._told, self._least_scale)
         cheaper = truncated_cost(fair, found.poses) < (1.0 - _MARGIN) * truncated_cost(fair, best.poses)
         return found if cheaper else best

@@ -71,8 +71,8 @@ class Robust:
         last solution from nothing, there is one again, and the better one is kept. A loop that is written several
         times counts once.
         """
-        solution = self._corrected(_with_copies_once(problem), start)
-        return replace(solution, problem=problem, loop_weights=problem.trust * (solution.loop_weights > 0.0))
+        solution = self._corrected(with_copies_once(problem), start)
+        return replace(solution, loop_weights=problem.trust * (solution.loop_weights > 0.0))
 
     def _corrected(self, problem: GraphProblem, start: CorrectedGraph | None) -> CorrectedGraph:
         loops = len(problem.loops)
@@ -98,7 +98,7 @@ def finished(
     return _polished(problem, poses, scale, len(problem.loops), least_scale)
 
 
-def _with_copies_once(problem: GraphProblem) -> GraphProblem:
+def with_copies_once(problem: GraphProblem) -> GraphProblem:
     """The problem in which copies of a loop share its trust: written again, it is no second witness."""
     loops = problem.loops
     written = np.concatenate((loops.nodes, loops.relative, loops.root.reshape(len(loops), 9)), axis=1)

@@ -175,11 +175,11 @@ class Localiser:
             self._track = fused(seen, *self._track)
 
     def _beyond_doubt(self) -> Mode | None:
-        """The mode that may be claimed: the only one where the way is clear, or one with many sightings."""
+        """The strongest mode, if it is the only one where the way is clear, or has many sightings."""
         matcher = self._matcher
         few = [mode for mode in self._modes if self._supported(self._sure, mode, ())]
         clear = [mode for mode in few if matcher.is_clear(mode.pose_xyyaw)]
-        if len(clear) == 1:
+        if len(clear) == 1 and clear[0].support >= self._modes[0].support:
             return clear[0]
         many = [mode for mode in few[:1] if self._supported(self.config, mode, self._modes[1:])]
         return next((mode for mode in many if matcher.allows(mode.pose_xyyaw)), None)
