@@ -18,6 +18,7 @@ from rosbags.rosbag2 import CompressionMode, Reader, StoragePlugin
 from ngo_recordings.definitions import message_definition
 from ngo_recordings.errors import RecordingError
 from ngo_recordings.recording import Message, TopicInfo, open_recording
+from ngo_recordings.topics import choose_topics
 from ngo_recordings.writer import RecordingWriter
 
 from . import messages as m
@@ -407,6 +408,31 @@ def test_packed_files_without_their_metadata_are_read(tmp_path: Path) -> None:
             with open_recording([opened]) as recording:
                 found = [each.value.pose.pose.position.x for each in recording.messages()]
                 assert found == pytest.approx([0.1 * k for k in range(9)])
+
+
+@pytest.mark.parametrize("metadata", [True, False])
+def test_of_files_that_are_cut_in_the_middle_the_beginning_is_read(tmp_path: Path, metadata: bool) -> None:
+    kinds = ((StoragePlugin.SQLITE3, CompressionMode.NONE), (StoragePlugin.MCAP, CompressionMode.FILE))
+    for storage, mode in kinds:
+        bag = m.write_rosbag(tmp_path / storage.name, odometries(4000), storage, mode)
+        (file,) = (each for each in bag.iterdir() if each.name != "metadata.yaml")
+        file.write_bytes(file.read_bytes()[: 7 * file.stat().st_size // 10])
+        if not metadata:
+            (bag / "metadata.yaml").unlink()
+        with open_recording([bag]) as recording:
+            found = [each.value.pose.pose.position.x for each in recording.messages()]
+            assert recording.notes or recording.unfinished
+        assert 500 < len(found) < 4000 and found == pytest.approx([0.1 * k for k in range(len(found))])
+
+
+def test_a_file_that_is_cut_before_anything_is_whole_says_so(tmp_path: Path) -> None:
+    path = m.write_mcap(tmp_path / "a.mcap", odometries(50))
+    path.write_bytes(path.read_bytes()[:2000])
+    with (
+        open_recording([path]) as recording,
+        pytest.raises(RecordingError, match=r"there are none; a\.mcap is cut off before its first chunk ends"),
+    ):
+        choose_topics(recording)
 
 
 def test_a_topic_in_another_encoding_is_left_out_and_named(tmp_path: Path) -> None:

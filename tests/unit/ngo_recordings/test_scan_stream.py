@@ -159,6 +159,7 @@ def geometry(low: float, high: float, increment: float, rays: int) -> Any:
     [
         (-90, 90, 1.0, 181, 1.0, None, None),
         (-90, 90, 180 / 179, 180, 180 / 179, 1.0, "likely are 1.0000 deg"),
+        (-180, 178.0028, 359 / 360, 360, 359 / 360, 1.0, "one ray more"),
         (-90, 90, 0.5, 361, 0.5, None, None),
         (-90, 90, 1.0, 180, 1.0, None, "angle_max"),
         (-90, 90, 0.5, 181, 1.0, None, "contradicts its ends"),
@@ -212,13 +213,15 @@ def test_an_empty_scan_and_one_of_more_than_a_turn_do_not_end_a_recording(tmp_pa
     whole[0].ranges = np.zeros(0, np.float32)
     whole[2] = scan(stamp(2), rays=400, increment=increment)
     whole[3].range_min, whole[3].range_max = 12.0, 0.1  # leaves no range: neither is believed
+    whole[1].range_min = whole[1].range_max = math.nan
     entries = [("/scan", stamp(k), each) for k, each in enumerate(whole)]
     with open_recording([m.write_mcap(tmp_path / "a.mcap", entries)]) as recording:
         topics = choose_topics(recording)
         skipped: Counter[str] = Counter()
         found = [each for each in scan_stream(recording, topics, skipped=skipped) if isinstance(each, LidarScan)]
         assert [len(each.ranges) for each in found] == [360, 360, 360] and skipped == {BAD_SCAN: 1}
-        assert [each.range_max for each in found] == [10.0, 10.0, 0.0]
+        assert [each.range_max for each in found] == [0.0, 10.0, 0.0]
+        assert len(found[0].hits()) == 360
         described = describe_lidar(recording, topics)
     assert described.rays == 360 and "1 of the first 200 scans of /scan are damaged" in described.notes[0]
 
@@ -308,6 +311,16 @@ def test_without_transforms_the_mounting_is_not_known_unless_frames_are_the_same
     assert found.source == "the scan's own frame" and not found.base_from_scan_xyyaw.any()
     cyclic = m.transforms(static("a", "laser", 1, 0, 0), static("laser", "a", 1, 0, 0))
     assert mounted(tmp_path / "c.mcap", ("/tf_static", 1, cyclic)) is None
+
+
+def test_of_transforms_that_go_round_or_give_two_parents_those_count_that_lead_to_the_robot(tmp_path: Path) -> None:
+    right, back = static("base_link", "laser", 0.3, 0.1, 0.5), static("laser", "base_link", 0.0, 0.0, 0.0)
+    other, round_ = static("chassis", "laser", 0.9, 0.0, 0.0), static("laser", "chassis", 0.0, 0.0, 0.0)
+    for k, parts in enumerate([(right, back), (back, right), (right, other), (other, right), (right, other, round_)]):
+        found = mounted(tmp_path / f"{k}.mcap", ("/tf_static", 1, m.transforms(*parts)))
+        np.testing.assert_allclose(found.base_from_scan_xyyaw, [0.3, 0.1, 0.5], atol=1e-12)
+        assert ("/tf_static, whose transforms go round" in str(found)) == (k < 2)
+    assert "/tf_static, which gives laser several parents" in str(found)
 
 
 @pytest.mark.parametrize("own_topics", [False, True])

@@ -148,6 +148,15 @@ def test_a_recording_of_clouds_is_a_stream_of_scans(tmp_path: Path) -> None:
     assert described.mounting.tilt_rad < 1e-6
 
 
+def test_the_order_of_bytes_is_that_of_the_data_whatever_the_driver_says() -> None:
+    points, _ = turning()
+    for big in (False, True):
+        made = m.cloud(BEGIN_NS, fields(points), padding=5, big=big)
+        right = cloud_scan(made, "/points").ranges
+        made.is_bigendian = not big
+        np.testing.assert_array_equal(cloud_scan(made, "/points").ranges, right)
+
+
 def test_depth_is_a_scan_where_it_is_asked_for(tmp_path: Path) -> None:
     image, info = depth_image("32FC1")
     entries = [("/camera/camera_info", BEGIN_NS, info), ("/camera/depth", BEGIN_NS, image)]
@@ -155,6 +164,12 @@ def test_depth_is_a_scan_where_it_is_asked_for(tmp_path: Path) -> None:
         topics = choose_topics(recording, TopicArguments(scan_topics=("/camera/depth",)))
         (made,) = scan_stream(recording, topics)
         assert isinstance(made, LidarScan) and off_walls(made).max() < 0.03
+    _, early = depth_image("32FC1")
+    early.k = np.full(9, np.nan)
+    late = [("/camera/camera_info", BEGIN_NS - 1, early), *entries]
+    with open_recording([m.write_mcap(tmp_path / "c.mcap", late)]) as recording:
+        (made,) = scan_stream(recording, topics)
+        assert isinstance(made, LidarScan) and np.isfinite(made.ranges).sum() > 120
     without = [m.write_mcap(tmp_path / "b.mcap", entries[1:])]
     with (
         open_recording(without) as recording,

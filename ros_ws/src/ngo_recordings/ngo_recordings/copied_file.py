@@ -5,6 +5,7 @@ from __future__ import annotations
 import shutil
 import sqlite3
 from collections.abc import Callable, Collection, Iterator
+from contextlib import closing, suppress
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
@@ -16,6 +17,9 @@ from ngo_recordings.mcap_file import McapFile
 from ngo_recordings.rosbag_folder import RosbagFolder
 
 PACKED = "packed"
+_TABLES = ("schema", "metadata", "topics", "message_definitions", "messages")
+_VALID_FOR = 92
+"""Where a database's head says for which of its changes the size in it holds; else the size of the file counts."""
 _PACKED_NAMES = (".db3.zstd", ".mcap.zstd", ".db3.zst", ".mcap.zst")
 
 _MAGIC = {
@@ -66,6 +70,28 @@ def packed_file(path: Path, max_chunk_bytes: int) -> CopiedFile:
             zstandard.ZstdDecompressor().copy_stream(packed, whole)
 
     return CopiedFile(path, path.stem, unpack, max_chunk_bytes, "")
+
+
+def cut_database(path: Path, max_chunk_bytes: int) -> CopiedFile:
+    """A .db3 file whose end is missing, up to the first page that is."""
+
+    def salvage(copy: Path) -> None:
+        torn = copy.with_name("torn")
+        shutil.copyfile(path, torn)
+        with torn.open("r+b") as file:
+            file.seek(_VALID_FOR)
+            file.write(bytes(4))
+        with closing(sqlite3.connect(torn)) as source, closing(sqlite3.connect(copy)) as target:
+            known = dict(source.execute("SELECT name, sql FROM sqlite_master WHERE type = 'table'").fetchall())
+            for name in (table for table in _TABLES if table in known):
+                target.execute(known[name])
+                with suppress(sqlite3.DatabaseError):
+                    for row in source.execute(f"SELECT * FROM {name}"):
+                        target.execute(f"INSERT INTO {name} VALUES ({', '.join('?' * len(row))})", row)
+            target.commit()
+        torn.unlink()
+
+    return CopiedFile(path, path.name, salvage, max_chunk_bytes, f"{path.name} is cut off: what is whole is read")
 
 
 def kind_of(path: Path) -> str:

@@ -94,9 +94,9 @@ def scan_angles(message: Any, topic: str = "the scan") -> ScanAngles:
     The message's increment counts while ``angle_min + (n - 1) * increment`` is within 1.5 rays of angle_max, or of the
     same direction a turn further on. Otherwise,
     and where it is 0 or no number, ``(angle_max - angle_min) / (n - 1)`` counts, if that is an increment. An increment
-    that spreads n rays over a field of view as if they were n - 1 (180 rays over 180 deg: 1.0056 deg instead of 1 deg)
-    contradicts nothing; it counts and is noted. Of a scan of up to two turns the first turn counts. Angles that only
-    degrees can be are degrees.
+    that spreads n rays over a field of view as if they were n - 1 (180 rays over 180 deg: 1.0056 deg instead of 1 deg),
+    or n + 1, contradicts nothing; it counts and is noted. Of a scan of up to two turns the first turn counts. Angles
+    that only degrees can be are degrees.
 
     Raises:
         RecordingError: neither gives angles within a full turn.
@@ -138,13 +138,14 @@ def _angles(count: int, low: float, high: float, increment: float, topic: str) -
     if not math.isfinite(high) or (count > 1 and apart > 0.5 * abs(increment)):
         note = f"angle_max of {topic} is {math.degrees(high):.2f} deg, not that of its last ray: the increment counts"
         return ScanAngles(low, increment, note)
-    likely = math.copysign(abs(high - low) / count, increment)
-    if count > 1 and _is_round(likely) and not _is_round(increment):
-        note = (
-            f"{topic} has {count} rays over {math.degrees(abs(high - low)):.2f} deg, {given_deg:.4f} deg apart: likely "
-            f"are {math.degrees(likely):.4f} deg, and its field of view one ray less"
-        )
-        return ScanAngles(low, increment, note, likely)
+    likely = {"less": math.copysign(abs(high - low) / count, increment), "more": increment * count / max(count - 1, 1)}
+    for rays, each in likely.items():
+        if count > 1 and _is_round(each) and not _is_round(increment):
+            note = (
+                f"{topic} has {count} rays over {math.degrees(abs(high - low)):.2f} deg, {given_deg:.4f} deg apart: "
+                f"likely are {math.degrees(each):.4f} deg, and its field of view one ray {rays}"
+            )
+            return ScanAngles(low, increment, note, each)
     return ScanAngles(low, increment)
 
 
@@ -156,7 +157,7 @@ def scan_of(value: Any, topic: str, angle_increment: float | None = None) -> Lid
     """
     angles = scan_angles(value, topic)
     time_increment = float(value.time_increment)
-    low, high = float(value.range_min), float(value.range_max)
+    low, high = (0.0 if math.isnan(limit) else float(limit) for limit in (value.range_min, value.range_max))
     if low >= high > 0.0:  # between them is no range: neither is known
         low = high = 0.0
     return LidarScan(

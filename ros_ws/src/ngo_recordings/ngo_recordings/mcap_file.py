@@ -296,6 +296,8 @@ class McapFile:
             raise RecordingError(f"{self.path}: {next(iter(self._foreign.values()))}")
         # A topic that nobody uses is no reason to refuse the others.
         self.notes = tuple(f"{self.path.name}: {reason}: left out" for reason in dict.fromkeys(self._foreign.values()))
+        if self.unfinished and not self.topics:
+            self.notes = (f"{self.path.name} is cut off before its first chunk ends: nothing of it can be read",)
 
     def _extent(self, channel_id: int) -> tuple[int, int]:
         """First and last log time of a channel, from as few of the message indexes as that takes."""

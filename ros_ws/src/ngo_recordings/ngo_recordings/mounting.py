@@ -102,9 +102,18 @@ def find_pose(
     names = transform_topics(recording, topics.image)
     static = [name for name in names if name.endswith("static")]
     held, changed = _held_longest(recording, static, topics.image)
-    tree.take(held, static=True)
-    if (found := _lookup(tree, bases, scan_frame)) is not None:
-        source = ", ".join(static)
+    tree.take((said[0] for said in held), static=True)
+    found = _lookup(tree, bases, scan_frame)
+    source = ", ".join(static)
+    for first, *others in held:
+        for each in others:
+            if found is None:
+                tree.take((each,), static=True)
+                found = _lookup(tree, bases, scan_frame)
+                tree.take((first if found is None else each,), static=True)
+                source += f", which gives {first.child_frame_id} several parents" if found is not None else ""
+    if found is not None:
+        source += ", whose transforms go round" if tree.parent(tree.root(scan_frame)) else ""
         if changed & set(tree.between(found[0], scan_frame)):
             source += ", as it was said for the longest time: it changes on the way"
         return found[0], scan_frame, found[1], source
@@ -154,8 +163,9 @@ def _transforms(recording: Recording, names: list[str]) -> Iterator[tuple[int, A
             yield message.log_time_ns, each
 
 
-def _held_longest(recording: Recording, names: list[str], sensor: str) -> tuple[list[Any], set[str]]:
-    """Of each frame the static transform that holds longest while a sensor's topic is recorded, and which change."""
+def _held_longest(recording: Recording, names: list[str], sensor: str) -> tuple[list[list[Any]], set[str]]:
+    """The static transforms of each frame, first what holds longest while a sensor's topic is recorded, and which
+    frames change."""
     spans_ns = recording.spans_ns(sensor)
     said: dict[str, list[tuple[int, Any]]] = {}
     for log_time_ns, each in _transforms(recording, names):
@@ -170,7 +180,7 @@ def _held_longest(recording: Recording, names: list[str], sensor: str) -> tuple[
             held_ns = sum(max(0, min(until_ns, last + 1) - max(from_ns, first)) for first, last in spans_ns)
             total[value] = total.get(value, 0) + held_ns
             last[value] = each
-        held.append(last[max(total, key=lambda value: total[value])])
+        held.append([last[value] for value in sorted(total, key=lambda value: -total[value])])
         if len(total) > 1:
             changed.add(child)
     return held, changed

@@ -135,7 +135,9 @@ class TransformTree:
     def lookup(self, target: str, source: str, stamp_ns: int) -> Pose | None:
         """Pose of frame source in frame target; None where no chain of transforms joins them at this stamp."""
         up_from_target, up_from_source = self.above(target), self.above(source)
-        common = next((frame for frame in up_from_source if frame in up_from_target), None)
+        # As tf2 walks: where transforms go round, first from the source up to the target.
+        shared = [frame for frame in up_from_source if frame in up_from_target]
+        common = target if target in shared else next(iter(shared), None)
         if common is None:
             return None
         common_from_source = self._up(up_from_source, common, stamp_ns)

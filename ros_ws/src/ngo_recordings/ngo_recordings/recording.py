@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import heapq
 from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
@@ -14,7 +14,16 @@ import yaml
 
 from ngo_recordings.bounds import MAX_CHUNK_BYTES, check_regular, unpacked
 from ngo_recordings.carmen_log import CarmenLog
-from ngo_recordings.copied_file import PACKED, CopiedFile, database_with_log, has_log, kind_of, named_kind, packed_file
+from ngo_recordings.copied_file import (
+    PACKED,
+    CopiedFile,
+    cut_database,
+    database_with_log,
+    has_log,
+    kind_of,
+    named_kind,
+    packed_file,
+)
 from ngo_recordings.decoding import Decoder
 from ngo_recordings.errors import RecordingError
 from ngo_recordings.mcap_file import McapFile
@@ -171,7 +180,14 @@ def _open_sources(path: Path, max_chunk_bytes: int, notes: list[str]) -> Iterato
 
 
 def _database(path: Path, max_chunk_bytes: int) -> Source:
-    return database_with_log(path, max_chunk_bytes) if has_log(path) else RosbagFolder(path)
+    if has_log(path):
+        return database_with_log(path, max_chunk_bytes)
+    try:
+        return RosbagFolder(path)
+    except RecordingError as error:
+        with suppress(RecordingError):
+            return cut_database(path, max_chunk_bytes)
+        raise error
 
 
 def _ros1_bag(path: Path, max_chunk_bytes: int) -> Source:
@@ -213,7 +229,13 @@ def _open_folder(path: Path, max_chunk_bytes: int, notes: list[str]) -> Iterator
             for name in names:
                 yield _database(path / name, max_chunk_bytes)
             return
-        yield RosbagFolder(path)
+        try:
+            whole = RosbagFolder(path)
+        except RecordingError as error:
+            notes.append(f"{error}: its files are read one by one")
+            yield from _open_files(path, [path / name for name in names], max_chunk_bytes, notes)
+        else:
+            yield whole
         return
     for name in names:
         yield McapFile(path / name, max_chunk_bytes)

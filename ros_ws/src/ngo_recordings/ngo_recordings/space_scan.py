@@ -31,6 +31,9 @@ _NEAREST_M, _FARTHEST_M = 0.05, 1000.0
 _FARTHEST_DEPTH_M = 5.0
 """Errors of depth grow with its square: there they are 4 cm (Khoshelham and Elberink 2012)."""
 
+_SANE_M, _MOSTLY = (1e-5, 1e5), 0.8
+"""Coordinates are within these, mostly; else the driver says the wrong order of bytes, which PCL does not read."""
+
 _TIMES = ("time", "t", "timestamp", "time_stamp", "offset_time", "time_offset", "ts")
 _UNITS = (1.0, 1e-3, 1e-6, 1e-9)
 _LONGEST_S = 1.0
@@ -51,6 +54,9 @@ def cloud_scan(message: Any, topic: str) -> LidarScan:
     """
     values = _records(message, topic)
     names = values.dtype.names or ()
+    if "x" in names and (sane := _sane(values["x"])) < _MOSTLY:
+        swapped = values.view(values.dtype.newbyteorder())
+        values = swapped if _sane(swapped["x"]) > _MOSTLY > 2.0 * sane else values
     if not {"x", "y", "z"} <= set(names):
         raise RecordingError(f"a cloud of {topic} has the fields {', '.join(names) or 'none'}; expected x, y and z")
     points = np.stack([values[name].astype(np.float64) for name in "xyz"], axis=-1)
@@ -72,13 +78,15 @@ def depth_scan(message: Any, info: Any, topic: str) -> LidarScan:
     if info is None:
         raise RecordingError(f"no CameraInfo came on {info_topic(topic)}, which says how {topic} was taken")
     depth, _ = picture(message, IMAGE_TYPE, topic)
-    matrix = np.asarray(getattr(info, "k", getattr(info, "K", ())), np.float64)
+    matrix = camera_matrix(info)
     if depth.dtype != np.float32 or depth.shape[2] != 1:
         raise RecordingError(f"images of {topic} are {message.encoding!r}; expected depth, 16UC1 or 32FC1")
     height, width = depth.shape[:2]
-    if matrix.size != 9 or not (matrix[0] > 0.0 and matrix[4] > 0.0) or (info.height, info.width) != (height, width):
+    if not matrix.size or (info.height, info.width) != (height, width):
+        focal = f"{matrix[0]:g} pixels" if matrix.size else "not known"
         raise RecordingError(
-            f"an image of {topic} is {width} x {height}; its CameraInfo is of {info.width} x {info.height}, k {matrix}"
+            f"an image of {topic} is {width} x {height}; its CameraInfo is of {info.width} x {info.height}, its focal "
+            f"length {focal}"
         )
     ahead = depth[..., 0].astype(np.float64)
     ahead[~(ahead < _FARTHEST_DEPTH_M)] = np.nan
@@ -87,6 +95,13 @@ def depth_scan(message: Any, info: Any, topic: str) -> LidarScan:
     points = np.stack((ahead, left, up), axis=-1).reshape(-1, 3)
     frame = str(message.header.frame_id).strip("/")
     return _scan(points, None, _FARTHEST_DEPTH_M, header_stamp_ns(message), frame, topic)
+
+
+def camera_matrix(info: Any) -> np.ndarray:
+    """The camera matrix ``(9,)`` of a CameraInfo; nothing ``(0,)`` where it has none."""
+    matrix = np.asarray(getattr(info, "k", getattr(info, "K", ())), np.float64)
+    usable = matrix.size == 9 and np.isfinite(matrix).all() and matrix[0] > 0.0 and matrix[4] > 0.0
+    return matrix if usable else np.zeros(0)
 
 
 def info_topic(depth_topic: str) -> str:
@@ -106,7 +121,8 @@ def scan_reader(recording: Recording, topic: str, angle_increment: float | None 
     if type_name == CLOUD_TYPE:
         return partial(cloud_scan, topic=topic)
     if type_name == IMAGE_TYPE and info in recording.topics and recording.topics[info].count:
-        return partial(depth_scan, info=recording.first(info).value, topic=topic)
+        ready = (each.value for each in recording.messages([info]) if camera_matrix(each.value).size)
+        return partial(depth_scan, info=next(ready, recording.first(info).value), topic=topic)
     raise RecordingError(
         f"topic {topic} is {type_name}; expected {SCAN_TYPE}, {CLOUD_TYPE}, or depth with a CameraInfo on {info}"
     )
@@ -132,6 +148,12 @@ def _records(message: Any, topic: str) -> np.ndarray:
         raise RecordingError(f"a cloud of {topic} has the fields {', '.join(names)}; expected each name once")
     kind = np.dtype({"names": names, "formats": formats, "offsets": [f.offset for f in known], "itemsize": step})
     return np.ndarray((height, width), kind, data, 0, (row, step)).reshape(-1)
+
+
+def _sane(values: np.ndarray) -> float:
+    """Share of numbers that are coordinates; bytes in the other order are of any size."""
+    sizes = np.abs(values[np.isfinite(values) & (values != 0.0)].astype(np.float64))
+    return float(((sizes > _SANE_M[0]) & (sizes < _SANE_M[1])).mean()) if sizes.size else 1.0
 
 
 def _offsets_s(times: np.ndarray, stamp_s: float) -> np.ndarray | None:

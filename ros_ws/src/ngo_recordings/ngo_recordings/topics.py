@@ -302,7 +302,8 @@ def _choose_image(recording: Recording) -> str:
         if names:
             return names[0]
     raise RecordingError(
-        f"no topic is an image: expected {', '.join(SENSOR_TYPES)}; there are {_listed(recording.topics)}"
+        f"no topic is an image: expected {', '.join(SENSOR_TYPES)}; there are "
+        + "; ".join((_listed(recording.topics), *recording.notes))
     )
 
 

@@ -28,7 +28,7 @@ from ngo_recordings.imu import up_axis, up_direction, yaw_rate
 from ngo_recordings.laser_scan import LidarScan, scan_of
 from ngo_recordings.mounting import Mounting as KnownMounting
 from ngo_recordings.mounting import mounting_in
-from ngo_recordings.space_scan import cloud_scan, depth_scan, info_topic
+from ngo_recordings.space_scan import camera_matrix, cloud_scan, depth_scan, info_topic
 
 _TYPES = {"LaserScan": LaserScan, "PointCloud2": PointCloud2, "depth": Image}
 _MOUNTING_WAIT_NS = 2_000_000_000
@@ -95,7 +95,8 @@ class LidarInput:
         self._update()
 
     def _on_info(self, topic: str, message: CameraInfo) -> None:
-        self._infos[topic] = message
+        if topic not in self._infos or camera_matrix(message).size:
+            self._infos[topic] = message
 
     def _on_scan(self, topic: str, message: LaserScan | PointCloud2 | Image) -> None:
         try:

@@ -87,7 +87,8 @@ class LidarRun:
         """What a person should know of the run, a line each."""
         lines = self._odometry.remarks()
         if abs(lag_s := self._odometry.lag_s) >= _LEAST_LAG_S:
-            lines.append(f"scans are {lag_s:.2f} s older than their stamps, by the wheels' clock: corrected")
+            side = "older" if lag_s > 0.0 else "younger"
+            lines.append(f"scans are {abs(lag_s):.2f} s {side} than their stamps, by the wheels' clock: corrected")
         if yaw := math.degrees(self._odometry.mounting_yaw_rad):
             side = "left" if yaw > 0.0 else "right"
             lines.append(

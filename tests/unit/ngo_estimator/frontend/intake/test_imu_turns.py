@@ -27,17 +27,19 @@ def heard(imu: ImuTurns, late_s: float, factor: float, slip_rad: float, steps: i
     for k in range(steps):
         for reading in range(10):
             time_s = 0.1 * k + 0.01 * reading
-            said = factor * rate(time_s) + BIAS_RPS + float(noise.normal(0.0, 0.01))
+            said = factor * rate(time_s) + max(factor, 1.0) * (BIAS_RPS + float(noise.normal(0.0, 0.01)))
             imu.add(10**9 + round((time_s + late_s) * 1e9), said)
         turn = yaw(0.1 * k) - yaw(0.1 * (k - 1))
         by_scans, slip = turn + float(noise.normal(0.0, 0.002)), slip_rad * (k % 10 == 0)
         imu.observe(10**9 + (k - 1) * PERIOD_NS, 10**9 + k * PERIOD_NS, by_scans, turn + slip)
 
 
+@pytest.mark.parametrize("factor", [1.0, math.degrees(1.0)])
 @pytest.mark.parametrize("late_s", [0.0, 0.1, -0.3])
-def test_its_turns_are_used_where_wheels_slip_with_its_bias_and_delay_taken_out(late_s: float) -> None:
+def test_its_turns_are_used_where_wheels_slip_with_its_bias_and_delay_taken_out(late_s: float, factor: float) -> None:
     imu = ImuTurns()
-    heard(imu, late_s, 1.0, slip_rad=0.1)
+    heard(imu, late_s, factor, slip_rad=0.1)
+    assert ("degrees/s" in imu.remark()) == (factor != 1.0)
     assert imu.used and "stand in for the wheels'" in imu.remark()
     assert imu.late_ns == pytest.approx(late_s * 1e9) and imu.bias_rps == pytest.approx(BIAS_RPS, abs=0.005)
     turn = imu.turn(10**9 + 120 * PERIOD_NS, 10**9 + 130 * PERIOD_NS)
@@ -46,7 +48,7 @@ def test_its_turns_are_used_where_wheels_slip_with_its_bias_and_delay_taken_out(
 
 @pytest.mark.parametrize(
     ("late_s", "factor", "slip_rad"),
-    [(0.0, 1.0, 0.0), (0.0, -1.0, 0.1), (0.0, 0.0, 0.1), (0.3, 1.0, 0.1), (0.0, 57.3, 0.1)],
+    [(0.0, 1.0, 0.0), (0.0, -1.0, 0.1), (0.0, 0.0, 0.1), (0.3, 1.0, 0.1), (0.0, 5.0, 0.1)],
 )
 def test_it_is_not_used_where_wheels_are_good_or_it_is_wrong(late_s: float, factor: float, slip_rad: float) -> None:
     imu = ImuTurns()

@@ -82,6 +82,15 @@ def test_ranges_in_millimetres_are_told_and_scaled(limit_m: float, unit: float, 
     assert scanner.remarks("laser") == ["laser: its ranges are in millimetres: taken so"]
 
 
+@pytest.mark.parametrize("limits_m", [(100.0, 120.0), (50.0, 12_000.0), (15.0, 0.0)])
+def test_limits_that_contradict_all_ranges_are_told_and_not_used(limits_m: tuple[float, float]) -> None:
+    scanner = Scanner()
+    for scan in drive(10):
+        found = scanner.correct(replace(scan, range_min=limits_m[0], range_max=limits_m[1]), 0.0)
+    assert found is not None and len(found.hits()) == len(scan.hits())
+    assert scanner.remarks("laser") == ["laser: its smallest range is above what it measures: its limits are not used"]
+
+
 def test_a_driver_that_begins_with_ranges_far_away_is_in_metres_again() -> None:
     scanner, scans = Scanner(), drive(20)
     for scan in scans[:5]:

@@ -1,8 +1,8 @@
 """The robot's turns by an IMU, which stand in for those of the wheels where they agree better with the scans.
 
-A gyroscope knows nothing of slipping wheels. Its bias is what it says beyond the scans, and its stamps are late by the
-time at which it agrees best. A gyroscope that is wrong, of the wrong sign or in a wrong frame agrees less with the
-scans than wheels do, and is not used.
+A gyroscope knows nothing of slipping wheels. Its bias is what it says beyond the scans, its stamps are late by the time
+at which it agrees best, and its unit, rad/s or degrees/s, is the one in which it does. A gyroscope that is wrong, of
+the wrong sign or in a wrong frame agrees less with the scans than wheels do, and is not used.
 """
 
 import math
@@ -30,6 +30,9 @@ _LARGEST_RAD = 0.1
 """A larger difference counts as this."""
 
 _LATE_NS = np.arange(-500_000_000, 500_000_001, 50_000_000)
+_UNITS = np.array((1.0, math.radians(1.0)))
+"""Rad/s, and degrees/s."""
+
 _LATEST_NS = 150_000_000
 """How late stamps may be: what is compared, and what is not too late for the scans that wait for it."""
 
@@ -49,7 +52,7 @@ class ImuTurns:
         self._rate = 0.0
         self._steps: deque[tuple[int, int, float, float]] = deque(maxlen=_KEPT)  # from, to, by scans, by wheels
         self._time_s = self._count = self._turned = self._wheels_off = 0.0
-        self._ahead, self._off = np.zeros(len(_LATE_NS)), np.zeros(len(_LATE_NS))
+        self._ahead, self._off = np.zeros((2, len(_UNITS), len(_LATE_NS)))
 
     def interrupt(self) -> None:
         """Forget the readings; what was learned of the IMU stays."""
@@ -60,16 +63,21 @@ class ImuTurns:
     @property
     def late_ns(self) -> int:
         """How late its stamps are."""
-        return int(_LATE_NS[self._off.argmin()]) if self._count >= _LEAST_STEPS else 0
+        return int(_LATE_NS[self._off.argmin() % len(_LATE_NS)]) if self._count >= _LEAST_STEPS else 0
+
+    @property
+    def unit(self) -> float:
+        """What its readings must be multiplied by."""
+        return float(_UNITS[self._off.argmin() // len(_LATE_NS)]) if self._count >= _LEAST_STEPS else 1.0
 
     @property
     def bias_rps(self) -> float:
         """What it says while the robot does not turn (rad/s)."""
-        return float(self._ahead[self._off.argmin()] / self._time_s) if self._time_s > 0.0 else 0.0
+        return float(self._ahead.flat[self._off.argmin()] / self._time_s) if self._time_s > 0.0 else 0.0
 
     def add(self, stamp_ns: int, rate_rps: float) -> None:
         """Take a yaw rate about the robot's z; one that is no number, or not newer than the last, is left out."""
-        if not abs(rate_rps) <= _FASTEST_RPS:
+        if not abs(rate_rps) <= _FASTEST_RPS / (self.unit if self._count >= _LEAST_STEPS else _UNITS[-1]):
             return
         self._heard = True
         gap_ns = stamp_ns - self._stamps[-1] if self._stamps else 0
@@ -93,7 +101,11 @@ class ImuTurns:
     def turn(self, from_ns: int, to_ns: int) -> float | None:
         """The turn between two stamps without the bias (rad); None where readings are missing."""
         begin, end = self._sum(from_ns + self.late_ns), self._sum(to_ns + self.late_ns)
-        return None if begin is None or end is None else end - begin - self.bias_rps * (to_ns - from_ns) * 1e-9
+        return (
+            None
+            if begin is None or end is None
+            else self.unit * (end - begin) - self.bias_rps * (to_ns - from_ns) * 1e-9
+        )
 
     def observe(self, from_ns: int, to_ns: int, by_scans: float, by_wheels: float) -> None:
         """Take the turn of the robot between two scans, which were taken then, as scans and wheels say it (rad)."""
@@ -109,6 +121,7 @@ class ImuTurns:
         times = np.array(self._stamps[max(first, 0) : last]) - from_ns
         sums = np.array(self._sums[max(first, 0) : last])
         raw = np.interp(to_ns - from_ns + _LATE_NS, times, sums) - np.interp(_LATE_NS, times, sums)
+        raw = _UNITS[:, None] * raw
         elapsed_s = (to_ns - from_ns) * 1e-9
         self._time_s = _REMEMBERED * self._time_s + elapsed_s
         self._ahead = _REMEMBERED * self._ahead + (raw - by_scans)
@@ -130,7 +143,8 @@ class ImuTurns:
                 "the IMU is not used: nothing could be compared with it, for want of wheels or of stamps of one clock"
             )
         deviations = [math.degrees(math.sqrt(off / self._count)) for off in (self._off.min(), self._wheels_off)]
-        late = f", with stamps {self.late_ns * 1e-9:.2f} s late" if self.late_ns else ""
+        late = ", its rates being in degrees/s" if self.unit != 1.0 else ""
+        late += f", with stamps {self.late_ns * 1e-9:.2f} s late" if self.late_ns else ""
         beside = (
             f"its turns are {deviations[0]:.2f} deg off from scan to scan{late}, the wheels' {deviations[1]:.2f} deg"
         )

@@ -1,4 +1,4 @@
-"""Ranges that a driver gives in millimetres: nearly all of them would be farther than any scanner sees."""
+"""Ranges or limits that a driver gives in another unit: no scanner sees so far, or measures less than its least."""
 
 from dataclasses import replace
 
@@ -29,7 +29,7 @@ class RangeUnit:
     def __init__(self) -> None:
         self.millimetres = False
         """Whether ranges are in millimetres."""
-        self._doubted = 0
+        self._doubted = self._below = 0
 
     def metres(self, scan: LidarScan) -> LidarScan:
         """The scan in metres, also its limits where these are not."""
@@ -38,16 +38,21 @@ class RangeUnit:
         self._doubted = self._doubted + 1 if doubted else 0
         if self._doubted >= _SCANS:
             self.millimetres, self._doubted = not self.millimetres, 0
-        if not self.millimetres:
-            return scan
         low, high = scan.range_min, scan.range_max
+        if not self.millimetres:
+            if not _LEAST_LIMIT_M < low > far > 0.0:
+                return scan
+            self._below += 1
+            return replace(scan, range_min=0.0, range_max=0.0)
         low = 0.001 * low if low > _LEAST_LIMIT_M else low
         high = 0.001 * high if high > max(near, _FAR) else high
         return replace(scan, ranges=scan.ranges * _METRES, range_min=low, range_max=high)
 
     def remark(self) -> str:
-        """In words; nothing where ranges are in metres."""
-        return "its ranges are in millimetres: taken so" if self.millimetres else ""
+        """In words; nothing where ranges and limits are in metres."""
+        if self.millimetres:
+            return "its ranges are in millimetres: taken so"
+        return "its smallest range is above what it measures: its limits are not used" if self._below >= _SCANS else ""
 
 
 def _nearly_all(ranges: np.ndarray) -> tuple[float, float]:
