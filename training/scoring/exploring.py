@@ -215,7 +215,7 @@ class _Run:
         follower.stop()
         while self.sight.time_s < most_s and pilot.state != DONE:
             mapped, decided = self.look(), pilot.decided
-            begun_s = time.process_time() if mapped else 0.0  # to ask for it takes as long as a period
+            begun_s = time.process_time() if mapped else 0.0  # asking costs as much as a step
             if mapped or exploration.known.empty:
                 exploration.known.update(self.found.values, RESOLUTION_M, self.found.origin_xy)
             pilot.step(self.pose_xyyaw, self.sight.time_s)

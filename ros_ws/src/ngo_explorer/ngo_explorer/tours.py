@@ -1,4 +1,4 @@
-"""Tours over places, from the robot to anywhere, short or soon where it pays: nearest insertion, 2-opt and or-opt."""
+"""Tours over places that are short, or see the most early: by nearest insertion, then 2-opt and or-opt."""
 
 from __future__ import annotations
 
@@ -14,8 +14,8 @@ Ints = NDArray[np.int64]
 def tour(first_m: Floats, between_m: Floats, start: int = -1, worth: Floats | None = None) -> tuple[Ints, float]:
     """The order ``(n,)`` in which to visit n places, and what it costs: its length in m.
 
-    With ``worth`` ``(n,)`` of the places, over 0, the cost is the sum of the ways until each of them by its worth, as
-    of a travelling repairman. first_m: ``(n,)`` ways from the robot. between_m: ``(n, n)`` ways between the places.
+    With ``worth`` ``(n,)`` of the places, not all 0, the cost is the sum of the ways until each of them by its worth,
+    as of a travelling repairman. first_m: ``(n,)`` ways from the robot. between_m: ``(n, n)`` ways between the places.
     start: the place to visit first; -1: any.
     """
     order = _inserted(first_m, between_m, start)
