@@ -113,6 +113,12 @@ def brute_force(first: np.ndarray, between: np.ndarray) -> float:
     )
 
 
+def test_a_robot_that_seems_to_stand_in_a_wall_is_on_one_side_of_it() -> None:
+    known = known_of(drawn("#" * 22, *[f"#{'.' * 9}##{'.' * 9}#"] * 20, "#" * 22))
+    field = cost_field(known, np.array((1.1, 1.1)), NEED_M)
+    assert sorted(((field[:, :5] >= 0).any(), (field[:, 6:] >= 0).any())) == [False, True]
+
+
 def test_a_tour_over_seven_places_is_the_shortest_or_nearly() -> None:
     rng = np.random.default_rng(1)
     ratios = []

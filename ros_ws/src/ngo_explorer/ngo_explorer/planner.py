@@ -66,10 +66,10 @@ def line_is_free(known: KnownMap, begin_xy: Floats, end_xy: Floats, need_m: floa
 
 
 def _start_blocks(known: KnownMap, start_xy: Floats, need_m: float) -> NDArray[np.int64]:
-    """Blocks ``(n, 2)`` that the robot can be in, up to need_m away, or else the nearest one; none: there is none.
+    """Blocks ``(n, 2)`` that the robot can be in, up to need_m away, or else a nearest one; none: there is none.
 
-    No wall lies between: it would be nearer to such a block than need_m. All of them count, since the one that the
-    robot is in may be cut off by a cell.
+    To within a block, no wall lies between the robot and those up to need_m away: it would be nearer to them than
+    need_m. All of them count, since the one that the robot is in may be cut off by a cell.
     """
     row, column = (value // known.block for value in known.cell(start_xy))
     side_m = known.block * known.resolution_m
@@ -78,7 +78,8 @@ def _start_blocks(known: KnownMap, start_xy: Floats, need_m: float) -> NDArray[n
     near = known.roomy_m[low_row : max(0, row + reach + 1), low_column : max(0, column + reach + 1)]
     found = np.argwhere(near >= need_m) + (low_row, low_column)
     away_m = side_m * np.hypot(*(found - (row, column)).T)
-    return found[away_m <= max(need_m, away_m.min(initial=math.inf))]
+    within = found[away_m <= need_m]
+    return within if len(within) or not len(found) else found[[np.argmin(away_m)]]
 
 
 @njit(cache=True)
