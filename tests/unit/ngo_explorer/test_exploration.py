@@ -196,6 +196,70 @@ def test_a_robot_behind_which_a_door_shuts_waits_for_it_but_not_for_ever(opens_s
         assert 150.0 < times_s[-1] < 300.0 and 19.2 < way[-1][0] < 20.5, "it waits before the door"
 
 
+CORRIDORS = drawn("#" * 24, f"?{'.' * 22}#", "#" * 24, f"#{'.' * 22}#", "#" * 24, cells=10)
+"""Two that nothing joins. The upper one goes on where nothing is known."""
+
+
+def at(x: float, y: float = 3.5) -> np.ndarray:
+    return np.array((x, y, 0.0))
+
+
+def driven(boundary: np.ndarray | None = None) -> Exploration:
+    exploration = Exploration(ExplorerConfig(radius_m=0.2, wait_s=120.0), boundary)
+    exploration.known.update(CORRIDORS, RESOLUTION_M, np.zeros(2))
+    for x in np.arange(2.5, 20.0, 0.1):
+        exploration.due(at(x), 0.0)
+    return exploration
+
+
+def shut(exploration: Exploration, door: bool) -> None:
+    values = CORRIDORS.copy()
+    values[30:40, 150] = 100 if door else 0
+    exploration.known.update(values, RESOLUTION_M, np.zeros(2))
+
+
+def test_a_door_that_flaps_is_not_waited_for_for_ever_and_a_pause_is_no_wait() -> None:
+    exploration = driven()
+    pilot, left_s, now_s = Pilot(exploration, Nobody(), 0.5, None), [], 0.0
+    while pilot.state != DONE and now_s < 3000.0:
+        shut(exploration, now_s % 50.0 >= 10.0)
+        pilot.step(at(20.0), now_s)
+        left_s.append(pilot.wait_left_s)
+        now_s += 0.5
+        if len(left_s) == 100:
+            pilot.halted()
+            now_s += 500.0
+    waited = [left for left in left_s if left is not None]
+    assert waited[0] == 120.0 and np.diff(waited).min() > -1.0 and 120.0 < 0.5 * len(left_s) < 600.0
+    assert pilot.state == DONE and "the way there has shut" in [left.reason for left in exploration.left()]
+
+
+@pytest.mark.parametrize("opens_s", [60.0, math.inf])
+def test_a_door_that_shuts_on_the_way_home_is_waited_for(opens_s: float) -> None:
+    exploration = driven(np.array(((2.0, 0.0), (22.0, 0.0), (22.0, 5.0), (2.0, 5.0))))
+    pilot, states = Pilot(exploration, Nobody(), 0.5, at(2.5)), []
+    for step in range(1000):
+        shut(exploration, RETURNING in states and 0.5 * step < opens_s)
+        pilot.step(at(20.0), 0.5 * step)
+        states.append(pilot.state)
+        if pilot.state == DONE or (0.5 * step > opens_s and pilot.state == RETURNING):
+            break
+    assert 60.0 < 0.5 * step < 260.0
+    if opens_s < math.inf:
+        assert pilot.state == RETURNING and exploration.goal is not None and exploration.goal.path[-1][0] < 3.0
+    else:
+        assert [left.reason for left in exploration.left()] == ["no path leads back to the start"]
+
+
+def test_a_way_that_lies_behind_a_wall_since_the_map_has_jumped_is_no_door() -> None:
+    exploration = driven()
+    pilot = Pilot(exploration, Nobody(), 0.5, at(2.5))
+    for step in range(100):
+        pilot.step(at(20.0, 1.5), 0.5 * step)
+        assert pilot.wait_left_s is None
+    assert pilot.state == DONE
+
+
 def test_the_same_map_and_seed_give_the_same_goals() -> None:
     small = ROOMS[10:, :70].copy()
     small[:, 69] = small[0] = 100

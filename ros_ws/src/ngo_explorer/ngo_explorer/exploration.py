@@ -69,6 +69,7 @@ class Exploration:
         self._aside = PutAside()
         self._may_forget = True
         self._trail: list[Floats] = []
+        self._robot_xy = np.full(2, np.nan)
         self._decided_s = -math.inf
         self._best_way_m, self._progress_s = math.inf, 0.0
 
@@ -176,8 +177,11 @@ class Exploration:
     def shut_off(self, robot_xy: Floats, home_xy: Floats | None) -> Floats | None:
         """Where to wait ``(3,)`` for a way that the robot has driven and that has shut since, facing it.
 
-        None where there is none that leads to frontiers or home. Frontiers behind it have that as their reason.
+        None where there is none that leads to frontiers, or home where it began. Frontiers behind it have that as
+        their reason.
         """
+        if home_xy is not None and not (self._trail and np.hypot(*(self._trail[0] - home_xy)) < _TRAIL_M):
+            home_xy = None
         places = np.array([*self._trail, robot_xy] if home_xy is None else [home_xy, *self._trail, robot_xy])
         here = self._reached(cost_field(self.known, robot_xy, self.need_m), places)
         lost = ~here & here.any() & (not self._lite)
@@ -262,6 +266,10 @@ class Exploration:
         return int(np.count_nonzero(part)) * self.known.resolution_m >= 0.5 * self.config.frontier_m
 
     def _remember(self, robot_xy: Floats) -> None:
+        """Keep the way that the robot has driven; where the map jumps, what was driven lies elsewhere in it."""
+        if np.hypot(*(robot_xy - self._robot_xy)) > self.need_m:
+            self._trail.clear()
+        self._robot_xy = np.array(robot_xy)
         if not self._trail or np.hypot(*(self._trail[-1] - robot_xy)) >= _TRAIL_M:
             self._trail.append(np.array(robot_xy))
 

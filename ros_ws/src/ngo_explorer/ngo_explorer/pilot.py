@@ -42,7 +42,7 @@ class Pilot:
         self._driver, self._settle_s, self._home = driver, settle_s, home_xyyaw
         self._looks_left = _LOOKS
         self._waits: tuple[float, int] | None = None  # since when the robot waits for the map, and the map then
-        self._shut_s: float | None = None  # since when it waits for a way that has shut, and stands at its goal
+        self._shut_s: float | None = None  # until when its wait for a way that has shut is counted; it stands there
         self._wait_left_s = exploration.config.wait_s
 
     def step(self, robot_xyyaw: Floats, now_s: float) -> Goal | None:
@@ -50,6 +50,8 @@ class Pilot:
         exploration = self.exploration
         if self.state == DONE or exploration.known.empty:
             return None
+        if self._shut_s is not None:
+            self._wait_left_s, self._shut_s = self._wait_left_s - (now_s - self._shut_s), now_s
         if self.state == RETURNING:
             self._return(robot_xyyaw, now_s)
         elif exploration.goal is not None and self._driver.state == STUCK:
@@ -60,6 +62,15 @@ class Pilot:
         if self.state == EXPLORING and exploration.due(robot_xyyaw, now_s):
             self._decide(robot_xyyaw, now_s)
         return exploration.goal
+
+    @property
+    def wait_left_s(self) -> float | None:
+        """How long it still waits at most where a way has shut; None: it does not wait."""
+        return None if self._shut_s is None else max(0.0, self._wait_left_s)
+
+    def halted(self) -> None:
+        """The robot was stopped: what it does is decided anew, and the time until then counts as no wait."""
+        self.exploration.goal = self._shut_s = None
 
     def _decide(self, robot_xyyaw: Floats, now_s: float) -> None:
         before, self.decided = self.exploration.goal, self.decided + 1
@@ -87,7 +98,6 @@ class Pilot:
     def _wait(self, robot_xyyaw: Floats, now_s: float) -> bool:
         """Go where a way has shut, stand and look around again; False where none has, or it lasts too long."""
         place = self.exploration.shut_off(robot_xyyaw[:2], None if self._home is None else self._home[:2])
-        self._wait_left_s -= 0.0 if self._shut_s is None else now_s - self._shut_s
         self._shut_s = None if place is None or self._wait_left_s <= 0.0 else now_s
         if place is None or self._shut_s is None:
             return False
@@ -116,7 +126,11 @@ class Pilot:
         if home is None or (not new and self._driver.state == ARRIVED):
             self._end()
         elif not new and exploration.stands(robot_xyyaw[:2], now_s):
-            self._end(Left(home[:2], "the robot did not get back to the start"))
+            exploration.goal = None
+            if self._wait(robot_xyyaw, now_s):
+                self.state = EXPLORING
+            else:
+                self._end(Left(home[:2], "the robot did not get back to the start"))
         elif new or exploration.due(robot_xyyaw, now_s):
             goal = exploration.go_to(robot_xyyaw, home, now_s)
             if goal is None and exploration.known.forget_marks():

@@ -13,9 +13,9 @@ class ExplorerConfig(Settings):
 
     rule: str = setting(
         "tour",
-        "Chooses the next frontier. tour: the first of a tour that shows most soonest; random; nearest: "
-        "shortest path; explore_lite: 3 x distance - size, as that package; gain_distance: most unknown area a metre; "
-        "d_optimality: of the predicted pose graph.",
+        "Chooses the next frontier. tour: the first of a tour that sees the most unknown area early; random; "
+        "nearest: shortest path; explore_lite: 3 x distance - size, as that package; gain_distance: most unknown area "
+        "a metre; d_optimality: of the predicted pose graph.",
         choices=RULES,
     )
     radius_m: float = setting(0.22, "Radius of the robot, m.", minimum=0.02, maximum=2.0)
@@ -29,7 +29,7 @@ class ExplorerConfig(Settings):
     replan_s: float = setting(2.0, "Time between two decisions on the way, s.", minimum=0.1, maximum=600.0)
     switch: float = setting(0.15, "Share by which a new goal must be better than the present one.", minimum=0.0)
     progress_s: float = setting(15.0, "Time without progress after which a goal is put aside, s.", minimum=1.0)
-    wait_s: float = setting(1800.0, "Time that it waits in all where a way has shut behind it, s.", minimum=0.0)
+    wait_s: float = setting(300.0, "Time that it waits in all for ways that shut, s.", minimum=0.0, maximum=86400.0)
 
     def need_m(self, resolution_m: float) -> float:
         """Clearance that a cell of a map needs for the robot's middle."""

@@ -220,7 +220,7 @@ class ExploreNode(Node):
         """Stop the robot; what it does afterwards is decided anew."""
         self._driver.stop()
         if self._pilot is not None:
-            self._exploration.goal = None
+            self._pilot.halted()
         self._send_velocity(0.0, 0.0)
 
     def _send_velocity(self, speed: float, turn_rate: float) -> None:
@@ -243,6 +243,11 @@ class ExploreNode(Node):
             feedback.goal = pose_message(exploration.goal.pose_xyyaw, self._frame, stamp)
             self._goals.publish(feedback.goal)
             self._paths.publish(path_message(exploration.goal.path, self._frame, stamp))
+            if self._pilot is not None and (left_s := self._pilot.wait_left_s) is not None:
+                feedback.frontiers += len(exploration.unreachable)
+                x, y = exploration.goal.pose_xyyaw[:2]
+                said = f"the robot waits at ({x:.1f}, {y:.1f}) for a way that has shut, up to {left_s:.0f} s more"
+                self.get_logger().warning(said, throttle_duration_sec=30.0)
         if self._goal_handle is not None:
             self._goal_handle.publish_feedback(feedback)
 
