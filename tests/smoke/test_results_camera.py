@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from tests.unit.ngo_estimator.rendered_room import camera
 from training import results_camera
 
 pytestmark = pytest.mark.slow
@@ -19,6 +20,9 @@ def test_an_ablation_has_a_file_of_its_own(without: str, tmp_path: Path, monkeyp
     )["drives"].values()
     assert [path.name for path in tmp_path.iterdir()] == [f"camera.no_{without}.json"]
     assert (drive["odometry_ate_m"] == pytest.approx(drive["given_ate_m"])) == (without == "tracks")
+    odometry, graph = results_camera.estimators(camera(), without)
+    assert isinstance(odometry._describer, results_camera._Orb) == (without == "sift")
+    assert isinstance(graph._new_back_end()._corrector, results_camera._Believes) == (without == "corrector")
 
 
 def test_a_short_drive_on_a_map(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -38,17 +38,22 @@ def seen(pose: np.ndarray, points: np.ndarray, looks: np.ndarray, rough: float) 
     return KeyPicture(CENTRE, rays[ahead], std_rad[ahead], looks[ahead])
 
 
-def driven(
-    config: PictureLoopConfig, drift_rad: float, std_rad: float, rough: float = 0.0
-) -> tuple[PictureLoopFinder, np.ndarray]:
-    """A finder after one and a half rounds with an odometry that turns too far, and the true poses."""
+def place() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Points ``(n, 3)`` around, what they look like, and poses ``(STEPS, 3)`` of one and a half rounds."""
     rng = np.random.default_rng(1)
     points = rng.uniform((-8.0, -8.0, 0.0), (8.0, 8.0, 3.0), (1200, 3))
     points = points[np.linalg.norm(points[:, :2], axis=1) > 5.0]
     looks = rng.standard_normal((len(points), 32)).astype(np.float32)
     looks /= np.linalg.norm(looks, axis=1, keepdims=True)
     angle = np.arange(STEPS) * (2.0 * np.pi / ROUND)
-    truth = np.stack((2.0 * np.cos(angle), 2.0 * np.sin(angle), angle + 0.5 * np.pi), axis=1)
+    return points, looks, np.stack((2.0 * np.cos(angle), 2.0 * np.sin(angle), angle + 0.5 * np.pi), axis=1)
+
+
+def driven(
+    config: PictureLoopConfig, drift_rad: float, std_rad: float, rough: float = 0.0
+) -> tuple[PictureLoopFinder, np.ndarray]:
+    """A finder after one and a half rounds with an odometry that turns too far, and the true poses."""
+    points, looks, truth = place()
     finder, graph = PictureLoopFinder(config), PoseGraph()
     finder.append(seen(truth[0], points, looks, 0.0))
     for before, pose in zip(truth, truth[1:], strict=False):
@@ -67,6 +72,23 @@ def test_loops_have_the_true_relative_pose() -> None:
     deviations = np.sqrt(np.diagonal(loops.covariance, axis1=1, axis2=2))
     assert (np.abs(off) < 3.0 * deviations).all()
     assert np.abs(off[:, 2]).max() < 0.01 and np.median(np.abs(off)) < 0.02
+
+
+def test_nothing_is_triangulated_over_a_motion_that_nobody_saw() -> None:
+    points, looks, truth = place()
+    finder, graph = PictureLoopFinder(PictureLoopConfig()), PoseGraph()
+    pictures = [seen(pose, points, looks, 0.0) for pose in truth[:10]]
+    finder.append(pictures[0])
+    for node in range(1, 10):
+        relative = se2.between(truth[node - 1], truth[node]) + (0.5 * (node == 5), 0.0, 0.0)
+        graph.append(relative, np.diag((0.25, 0.25, 1e-4)), joins=node == 5)
+        graph.add_node()
+        finder.append(pictures[node])
+    for node in range(2, 8):
+        fitted = finder.fitted(node, pictures[node + 2], graph, (0.0, 1.0))
+        assert fitted is not None
+        off = se2.wrapped(fitted.relative - se2.between(truth[node], truth[node + 2]))
+        assert np.hypot(*off[:2]) < 0.05, node
 
 
 def test_features_that_are_found_roughly_turn_no_loop() -> None:

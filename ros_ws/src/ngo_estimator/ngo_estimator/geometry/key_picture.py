@@ -9,6 +9,9 @@ Array = np.ndarray
 MOST_FEATURES = 2000
 """Of a key picture: it bounds the time and memory that a message may cost."""
 
+LAYOUT = 2
+"""Of ``KeyPicture.packed``: saved states have it."""
+
 _LENGTHS = (8, 512)
 _HEADER = 4
 

@@ -9,12 +9,13 @@ from ngo_estimator.geometry.planar_motion import turned_covariance
 from ngo_estimator.geometry.view_pose import RangedRays
 from ngo_estimator.graph.path_covariance import path_covariances
 from ngo_estimator.graph.pose_graph import PoseGraph
+from ngo_estimator.graph.segments import segment_of
 from ngo_estimator.loops.picture_fit import PictureFit, fit, points_of
 from ngo_estimator.loops.picture_loops import PictureLoops
 from ngo_estimator.loops.picture_places import PicturePlaces
 from ngo_estimator.loops.picture_settings import PictureLoopConfig
 
-_NEIGHBOURS = (-2, -1, 1, 2)
+_NEIGHBOURS = np.array((-2, -1, 1, 2))
 
 
 class PictureLoopFinder:
@@ -45,7 +46,7 @@ class PictureLoopFinder:
         for other, covariance in zip(others.tolist(), covariances, strict=True):
             turn = float(se2.wrap(graph.poses[node, 2] - graph.poses[other, 2]))
             near = turn, self.config.turn_rad + self.config.deviations * float(np.sqrt(covariance[2, 2]))
-            fitted = self.fitted(other, self._pictures[node], graph.poses, near)
+            fitted = self.fitted(other, self._pictures[node], graph, near)
             if fitted is None or self._surprises(fitted, graph.poses[[other, node]], covariance):
                 continue
             pair, inliers = np.array(((other, node),)), np.array((fitted.inliers,))
@@ -57,9 +58,9 @@ class PictureLoopFinder:
         """How alike a picture is to each node's ``(n,)``; those that are not compared have -inf."""
         return self._places.alike(picture)
 
-    def fitted(self, node: int, picture: KeyPicture, poses: np.ndarray, near: tuple[float, float]) -> PictureFit | None:
-        """Where a picture was taken, seen from a node, with poses ``(nodes, 3)`` of all; see ``picture_fit.fit``."""
-        return fit(self.config, self._pictures[node], picture, self._points_of(node, poses), near)
+    def fitted(self, node: int, picture: KeyPicture, graph: PoseGraph, near: tuple[float, float]) -> PictureFit | None:
+        """Where a picture was taken, seen from a node; see ``picture_fit.fit``."""
+        return fit(self.config, self._pictures[node], picture, self._points_of(node, graph), near)
 
     def _surprises(self, fitted: PictureFit, poses: np.ndarray, covariance: np.ndarray) -> bool:
         """Whether a fit is far from where the graph has both nodes ``(2, 3)``: another place looks alike."""
@@ -90,10 +91,13 @@ class PictureLoopFinder:
         near = np.flatnonzero(away < config.apart_m + config.deviations * doubt)[: config.candidates]
         return ranked[near], covariance[near]
 
-    def _points_of(self, node: int, poses: np.ndarray) -> RangedRays:
-        """Features of a node's picture with ranges, by the pictures of its neighbours."""
+    def _points_of(self, node: int, graph: PoseGraph) -> RangedRays:
+        """Features of a node's picture with ranges, by the pictures of its neighbours in the same odometry."""
         if node not in self._points:
-            near = [node + step for step in _NEIGHBOURS if 0 <= node + step < len(self._pictures)]
+            odometry, poses = segment_of(graph.frames.joins, graph.frames.nodes), graph.poses
+            near = node + _NEIGHBOURS
+            near = near[(near >= 0) & (near < len(self._pictures))]
+            near = near[odometry[near] == odometry[node]].tolist()
             others = [(self._pictures[other], se2.between(poses[node], poses[other])) for other in near]
             self._points[node] = points_of(self._pictures[node], others, self.config)
         return self._points[node]

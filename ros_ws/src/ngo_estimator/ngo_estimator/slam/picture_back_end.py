@@ -23,9 +23,6 @@ from ngo_estimator.slam.step_log import TakenStep
 _KEYS_PER_OPTIMISED = 20
 """For each so many nodes an optimisation waits for one more key picture."""
 
-_LEAST_SHARE = 0.3
-"""Of the looks that must support a claimed pose: where no key picture looked the same way, a look tells nothing."""
-
 
 class PictureBackEnd(BackEnd):
     """Takes frames, keeps key pictures and their loops, and optimises all of them together."""
@@ -132,9 +129,12 @@ class PictureBackEnd(BackEnd):
         return len(self._finder.loops) > 0 and self._guarded("an optimisation", self._optimise)
 
     def localiser(self, origin: MapOrigin) -> Localiser:
-        """Localises in the key pictures as they are."""
-        matcher = PictureMatcher(self._finder, origin.poses(self.graph.poses.copy()))
-        return Localiser(matcher, LocalisationConfig(least_share=_LEAST_SHARE))
+        """Localises in the key pictures as they are; raises ``ValueError`` where they are too few.
+
+        No share of the looks must support a pose: where no key picture looked the same way, a look tells nothing.
+        """
+        matcher = PictureMatcher(self._finder, self.graph, origin.poses(self.graph.poses.copy()))
+        return Localiser(matcher, LocalisationConfig(least_share=0.0))
 
     SAVED = ("graph", "_finder", "_waiting", "closed", "_loops_from_nothing", "_scale")
 

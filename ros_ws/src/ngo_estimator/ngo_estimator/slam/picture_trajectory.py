@@ -3,6 +3,7 @@
 from dataclasses import asdict
 from typing import Any
 
+from ngo_estimator.geometry.key_picture import LAYOUT
 from ngo_estimator.loops.picture_settings import PictureGraphConfig
 from ngo_estimator.slam.corrected_trajectory import CorrectedTrajectory
 from ngo_estimator.slam.picture_back_end import PictureBackEnd
@@ -34,8 +35,8 @@ class PictureTrajectory(CorrectedTrajectory):
 
     @property
     def identity(self) -> dict[str, Any]:
-        """The settings: there are no networks."""
-        return {"camera": asdict(self._config)}
+        """The settings, and the layout of key pictures: there are no networks."""
+        return {"key_picture_layout": LAYOUT, "camera": asdict(self._config)}
 
     def _new_back_end(self) -> PictureBackEnd:
         return PictureBackEnd(self._config)
