@@ -412,9 +412,10 @@ def test_packed_files_without_their_metadata_are_read(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("metadata", [True, False])
 def test_of_files_that_are_cut_in_the_middle_the_beginning_is_read(tmp_path: Path, metadata: bool) -> None:
-    kinds = ((StoragePlugin.SQLITE3, CompressionMode.NONE), (StoragePlugin.MCAP, CompressionMode.FILE))
-    for storage, mode in kinds:
-        bag = m.write_rosbag(tmp_path / storage.name, odometries(4000), storage, mode)
+    sqlite3_file, mcap_file = StoragePlugin.SQLITE3, StoragePlugin.MCAP
+    none, packed = CompressionMode.NONE, CompressionMode.FILE
+    for k, (storage, mode) in enumerate([(sqlite3_file, none), (sqlite3_file, packed), (mcap_file, packed)]):
+        bag = m.write_rosbag(tmp_path / str(k), odometries(4000), storage, mode)
         (file,) = (each for each in bag.iterdir() if each.name != "metadata.yaml")
         file.write_bytes(file.read_bytes()[: 7 * file.stat().st_size // 10])
         if not metadata:

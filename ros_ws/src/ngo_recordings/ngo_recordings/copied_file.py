@@ -6,6 +6,7 @@ import shutil
 import sqlite3
 from collections.abc import Callable, Collection, Iterator
 from contextlib import closing, suppress
+from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
@@ -42,8 +43,17 @@ class CopiedFile:
         copy = Path(self._folder.name, name)
         try:
             fill(copy)
-            self._file = McapFile(copy, max_chunk_bytes) if kind_of(copy) == ".mcap" else RosbagFolder(copy)
-        except (OSError, sqlite3.Error, zstandard.ZstdError, RecordingError) as error:
+            if kind_of(copy) == ".mcap":
+                self._file: McapFile | RosbagFolder = McapFile(copy, max_chunk_bytes)
+            else:
+                try:
+                    self._file = RosbagFolder(copy)
+                except RecordingError:
+                    whole = Path(self._folder.name, "whole.db3")
+                    _salvage(copy, whole)
+                    self._file = RosbagFolder(whole)
+                    note = f"{path.name} is cut off: what is whole is read{'; ' * bool(note)}{note}"
+        except (OSError, TypeError, ValueError, sqlite3.Error, sqlite3.Warning, zstandard.ZstdError) as error:
             self._folder.cleanup()
             reason = " ".join(str(error).replace(str(copy), str(path)).split())
             raise RecordingError(f"{path} cannot be read: {reason}") from None
@@ -74,24 +84,22 @@ def packed_file(path: Path, max_chunk_bytes: int) -> CopiedFile:
 
 def cut_database(path: Path, max_chunk_bytes: int) -> CopiedFile:
     """A .db3 file whose end is missing, up to the first page that is."""
+    return CopiedFile(path, path.name, partial(shutil.copyfile, path), max_chunk_bytes, "")
 
-    def salvage(copy: Path) -> None:
-        torn = copy.with_name("torn")
-        shutil.copyfile(path, torn)
-        with torn.open("r+b") as file:
-            file.seek(_VALID_FOR)
-            file.write(bytes(4))
-        with closing(sqlite3.connect(torn)) as source, closing(sqlite3.connect(copy)) as target:
-            known = dict(source.execute("SELECT name, sql FROM sqlite_master WHERE type = 'table'").fetchall())
-            for name in (table for table in _TABLES if table in known):
-                target.execute(known[name])
-                with suppress(sqlite3.DatabaseError):
-                    for row in source.execute(f"SELECT * FROM {name}"):
-                        target.execute(f"INSERT INTO {name} VALUES ({', '.join('?' * len(row))})", row)
-            target.commit()
-        torn.unlink()
 
-    return CopiedFile(path, path.name, salvage, max_chunk_bytes, f"{path.name} is cut off: what is whole is read")
+def _salvage(torn: Path, whole: Path) -> None:
+    """Copy what can be read of a database; the size that its head says counts no more. Writes to ``torn``, too."""
+    with torn.open("r+b") as file:
+        file.seek(_VALID_FOR)
+        file.write(bytes(4))
+    with closing(sqlite3.connect(torn)) as source, closing(sqlite3.connect(whole)) as target:
+        known = dict(source.execute("SELECT name, sql FROM sqlite_master WHERE type = 'table'").fetchall())
+        for name in (table for table in _TABLES if table in known):
+            target.execute(known[name])
+            with suppress(sqlite3.Error, UnicodeDecodeError):
+                for row in source.execute(f"SELECT * FROM {name}"):
+                    target.execute(f"INSERT INTO {name} VALUES ({', '.join('?' * len(row))})", row)
+        target.commit()
 
 
 def kind_of(path: Path) -> str:

@@ -106,12 +106,13 @@ def find_pose(
     found = _lookup(tree, bases, scan_frame)
     source = ", ".join(static)
     for first, *others in held:
-        for each in others:
-            if found is None:
-                tree.take((each,), static=True)
-                found = _lookup(tree, bases, scan_frame)
-                tree.take((first if found is None else each,), static=True)
-                source += f", which gives {first.child_frame_id} several parents" if found is not None else ""
+        for each in others if found is None else ():
+            tree.take((each,), static=True)
+            if (found := _lookup(tree, bases, scan_frame)) is not None:
+                source += f", which gives {first.child_frame_id} several parents"
+                changed.discard(first.child_frame_id.strip("/"))
+                break
+            tree.take((first,), static=True)
     if found is not None:
         source += ", whose transforms go round" if tree.parent(tree.root(scan_frame)) else ""
         if changed & set(tree.between(found[0], scan_frame)):
