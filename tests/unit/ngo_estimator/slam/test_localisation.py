@@ -105,6 +105,11 @@ def test_few_looks_are_enough_where_the_way_is_clear_and_none_where_places_look_
         first[clear] = [one.claimed for one in drive(Localiser(at), at, 40)].index(True)
     assert first[True] < 7 < first[False] < 20
     at = Map()
+    at.clear = at.copies
+    localiser = Localiser(at)
+    localiser.take_time()
+    assert [one.claimed for one in drive(localiser, at, 40)].index(True) == first[False]
+    at = Map()
     at.allowing = False
     assert not any(one.claimed for one in drive(Localiser(at), at, 60))
 

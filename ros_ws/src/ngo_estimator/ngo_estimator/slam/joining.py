@@ -24,6 +24,7 @@ class Joining:
         """
         self._core, self._origin = core, origin
         self._localisation = core.localisation(origin)
+        self._localisation.take_time()
 
     def reset(self) -> None:
         """Forget where the robot may be."""

@@ -114,6 +114,10 @@ class Localiser:
         self._track: tuple[np.ndarray, np.ndarray] | None = None
         self._modes: tuple[Mode, ...] = ()
 
+    def take_time(self) -> None:
+        """Claim nothing by few sightings: their pose is right, and too rough for what is mapped from there on."""
+        self._sure = self.config
+
     def set_pose(self, pose_xyyaw: np.ndarray, covariance: np.ndarray) -> None:
         """Take the newest frame's pose ``(3,)`` and covariance ``(3, 3)`` from somebody who knows them."""
         self._track = pose_xyyaw.astype(np.float64), covariance.astype(np.float64)
@@ -178,7 +182,8 @@ class Localiser:
         """The strongest mode, if it is the only one where the way is clear, or has many sightings."""
         matcher = self._matcher
         few = [mode for mode in self._modes if self._supported(self._sure, mode, ())]
-        clear = [mode for mode in few if matcher.is_clear(mode.pose_xyyaw)]
+        hurries = self._sure is not self.config
+        clear = [mode for mode in few if hurries and matcher.is_clear(mode.pose_xyyaw)]
         if len(clear) == 1 and clear[0].support >= self._modes[0].support:
             return clear[0]
         many = [mode for mode in few[:1] if self._supported(self.config, mode, self._modes[1:])]

@@ -39,6 +39,10 @@ class MapLocalisation:
         self._localiser, self._checked = localiser, checked
         self._log = StepLog()
 
+    def take_time(self) -> None:
+        """See ``Localiser``."""
+        self._localiser.take_time()
+
     def reset(self) -> None:
         """Forget the pose."""
         self._log.reset()
