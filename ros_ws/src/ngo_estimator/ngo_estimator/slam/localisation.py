@@ -100,6 +100,7 @@ class Localiser:
         self._sure = replace(
             config, least_support=config.sure_support, least_way_places=config.sure_way_places, least_share=0.0
         )
+        self._hurries = True
         self._matcher = matcher
         self._window = HypothesisWindow(self.config.window)
         self.reset()
@@ -116,7 +117,7 @@ class Localiser:
 
     def take_time(self) -> None:
         """Claim nothing by few sightings: their pose is right, and too rough for what is mapped from there on."""
-        self._sure = self.config
+        self._hurries = False
 
     def set_pose(self, pose_xyyaw: np.ndarray, covariance: np.ndarray) -> None:
         """Take the newest frame's pose ``(3,)`` and covariance ``(3, 3)`` from somebody who knows them."""
@@ -158,7 +159,7 @@ class Localiser:
         hypotheses, place_m = self._window.hypotheses(), self._matcher.place_m
         self._modes = strongest_modes(hypotheses, place_m)
         if self._track is None:
-            if (mode := self._beyond_doubt()) is not None:
+            if self._modes and (mode := self._beyond_doubt()) is not None:
                 agree = agreeing(hypotheses, mode.pose_xyyaw, mode.covariance, place_m)
                 self._track = fused(hypotheses.where(agree), mode.pose_xyyaw)
             return
@@ -180,14 +181,13 @@ class Localiser:
 
     def _beyond_doubt(self) -> Mode | None:
         """The strongest mode, if it is the only one where the way is clear, or has many sightings."""
-        matcher = self._matcher
-        few = [mode for mode in self._modes if self._supported(self._sure, mode, ())]
-        hurries = self._sure is not self.config
-        clear = [mode for mode in few if hurries and matcher.is_clear(mode.pose_xyyaw)]
-        if len(clear) == 1 and clear[0].support >= self._modes[0].support:
+        matcher, strongest = self._matcher, self._modes[0]
+        few = [mode for mode in self._modes if self._hurries and self._supported(self._sure, mode, ())]
+        clear = [mode for mode in few if matcher.is_clear(mode.pose_xyyaw)]
+        if len(clear) == 1 and clear[0].support >= strongest.support:
             return clear[0]
-        many = [mode for mode in few[:1] if self._supported(self.config, mode, self._modes[1:])]
-        return next((mode for mode in many if matcher.allows(mode.pose_xyyaw)), None)
+        many = self._supported(self.config, strongest, self._modes[1:])
+        return strongest if many and matcher.allows(strongest.pose_xyyaw) else None
 
     def _supported(self, config: LocalisationConfig, mode: Mode, others: Sequence[Mode]) -> bool:
         return may_claim(config, self._window, mode, others, self._matcher.place_m, len(self._window))
