@@ -76,6 +76,8 @@ class Arguments(Folders):
     mazes: int = 8  # Mazes of each scanner; 8 for the comparison with the networks of version 0.1.0.
     frames: int = 2000  # Scans in a maze.
     rows: tuple[str, ...] = ()  # Rows to measure, by name; none: all.
+    tables: tuple[Literal["logs", "buildings", "aliased", "slip", "maze2d", "scanners"], ...] = ()
+    """Tables to measure; none: all. The others hold what earlier runs measured."""
     known: bool = False
     """Measure nothing: the tables hold what earlier runs of this command measured, and say of how many drives."""
     weights: Path = records.WEIGHTS / "scan"  # Folder with lidar.json, the settings of our estimators.
@@ -202,7 +204,8 @@ def _measured(arguments: Arguments, name: str, drives: Sequence[Drive], rows: Ma
         (with_runs(drive, arguments.weights), {key: scored[key] for key, row in rows.items() if is_asked(index, row)})
         for index, drive in enumerate(drives)
     ]
-    return measure(plan, folder, name, known_only=arguments.known)
+    asked = not arguments.tables or ("scanners" if name in CONDITIONS else name) in arguments.tables
+    return measure(plan, folder, name, known_only=arguments.known or not asked)
 
 
 def _log_numbers(scored: Mapping[str, Measured]) -> dict[str, Numbers]:

@@ -5,8 +5,9 @@
     python -m training.results --world stress --tables buildings loops joins car --car RECORDING
 
 FOLDER holds logs (.bag, .log, .clf, gzipped or not) with relations as NAME.relations. What is measured is kept in
-``runs/``: a run that is restricted adds to the tables, and one that was stopped goes on. The tables hold all that the
-code of today has measured. The command writes ``training/results/stress.json`` and ``docs/results_stress.md``.
+``runs/``: a run that is restricted adds to the tables, and one that was stopped goes on. Where the code of today has
+measured nothing, what is published stays. The command writes ``training/results/stress.json`` and
+``docs/results_stress.md``.
 """
 
 from collections.abc import Mapping, Sequence
@@ -24,7 +25,7 @@ from training.report import stress_page
 from training.report.folders import Folders
 from training.scoring import stress_tables
 from training.scoring.lidar_bars import stress_bars
-from training.scoring.lidar_rows import ROWS
+from training.scoring.lidar_rows import FRONT_ABLATION, ROWS
 from training.scoring.lidar_scores import scored_rows, with_runs
 from training.scoring.stress_cells import CLEAN, StressLog, cell_numbers
 from training.scoring.stress_tables import StressTable
@@ -53,7 +54,7 @@ class Arguments(Folders):
     seeds: tuple[int, ...] = (0, 1, 2)
     """Seeds of the changes."""
     rows: tuple[str, ...] = ()
-    """Rows to measure, by name; none: all."""
+    """Rows to measure, by name; none: all but those of the ablation, without_*."""
     drives: int = 20
     """Simulated drives in each row of the tables of buildings, loops and joins."""
     length: float = 1.0
@@ -64,7 +65,10 @@ class Arguments(Folders):
     weights: Path = records.WEIGHTS / "scan"  # Folder with lidar.json, the settings of our estimators.
 
     def __post_init__(self) -> None:
-        for name, given, known in (("changes", self.changes, (*CHANGES,)), ("rows", self.rows, STRESS_ROWS)):
+        for name, given, known in (
+            ("changes", self.changes, (*CHANGES,)),
+            ("rows", self.rows, (*STRESS_ROWS, *FRONT_ABLATION)),
+        ):
             if unknown := [one for one in given if one not in known]:
                 raise ValueError(f"{name} has {', '.join(unknown)}; expected among {', '.join(known)}")
         if not self.seeds or min(self.seeds) < 0:
@@ -79,19 +83,37 @@ class Arguments(Folders):
 def main(arguments: Arguments) -> dict[str, Any]:
     """Measure, print each number, write everything, and return the JSON's content."""
     record = records.record("results", arguments)
-    rows = [name for name in STRESS_ROWS if not ROWS[name].missing()]
-    asked = [name for name in rows if name in (arguments.rows or rows)]
+    rows = [name for name in (*STRESS_ROWS, *FRONT_ABLATION) if name not in ROWS or not ROWS[name].missing()]
+    asked = [name for name in rows if name in (arguments.rows or STRESS_ROWS)]
     logs = {} if arguments.logs is None else _logs(arguments, rows, asked)
+    tables = {name: _simulated(arguments, name, table, asked) for name, table in _tables(arguments).items()}
+    if earlier := arguments.published("stress"):
+        logs = with_earlier(logs, earlier["logs"], earlier["revision"])
+        tables = with_earlier(tables, earlier["tables"], earlier["revision"])
     result = {
         "command": 'make results WORLD=stress ARGS="--logs FOLDER"',
         "revision": record["revision"],
         "settings": {name: getattr(arguments, name) for name in ("drives", "length", "split")},
         "logs": logs,
-        "tables": {name: _simulated(arguments, name, table, asked) for name, table in _tables(arguments).items()},
+        "tables": tables,
         "bars": [bar.as_json() for bar in stress_bars(logs)],
         "skipped": [f"{name}: {ROWS[name].missing()}" for name in STRESS_ROWS if name not in rows],
     }
     return arguments.publish("stress", result, stress_page.page(result))
+
+
+def with_earlier(tables: Mapping[str, Any], published: Mapping[str, Any], revision: str) -> dict[str, Any]:
+    """``TABLE.CHANGE.ROW`` with what is ``published`` and not measured anew; such a cell names its ``revision``."""
+    result: dict[str, Any] = {}
+    for table in dict.fromkeys((*tables, *published)):
+        old, new = published.get(table, {}), tables.get(table, {})
+        result[table] = {
+            change: {row: {"revision": revision, **cell} for row, cell in old.get(change, {}).items()}
+            | new.get(change, {})
+            for change in dict.fromkeys((*CHANGES, *old, *new))
+            if change in old or change in new
+        }
+    return result
 
 
 def _logs(arguments: Arguments, rows: Sequence[str], asked: Sequence[str]) -> dict[str, Any]:

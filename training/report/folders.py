@@ -23,6 +23,11 @@ class Folders:
         """Folder of the figures."""
         return self.docs / "images"
 
+    def published(self, name: str) -> dict[str, Any]:
+        """The content of ``NAME.json``; empty where there is none."""
+        path = self.out / f"{name}.json"
+        return json.loads(path.read_text()) if path.is_file() else {}
+
     def publish(self, name: str, result: dict[str, Any], page: str) -> dict[str, Any]:
         """Write ``NAME.json`` and ``results_NAME.md``; returns the content of the JSON."""
         write_at_once(self.out / f"{name}.json", json.dumps(result, indent=2) + "\n")

@@ -18,7 +18,8 @@ _INTRODUCTION = """# Results: what real robots do to their data
 Written by `{command}` at revision {revision}. Each row of a table is a log after one change, which is made in memory
 (`training/data/lidar_changes.py`). A cell is the mean translational error in m, and the mean rotational one in deg,
 over the relations that people checked ([lidar](results_scan.md)), at the times when scans were really taken. It is the
-mean over the seeds of a change; `±` is the half of the range between them.
+mean over the seeds of a change; `±` is the half of the range between them. The JSON names the revision of each cell
+that is of an earlier one.
 
 - **At scans**: our error over the relations with a scan at both ends alone. Elsewhere poses are interpolated.
 - **Best possible**: our own solution without the change, read at the scans that the change left.
@@ -29,6 +30,7 @@ def page(result: dict[str, Any]) -> str:
     """The page of a JSON's content."""
     parts = [_INTRODUCTION.format(**result)]
     parts += [f"## {log}\n\n{_table(table)}" for log, table in result["logs"].items()]
+    parts += [_ABLATION, *(f"### {log}\n\n{_ablation(table)}" for log, table in result["logs"].items())]
     if result["bars"]:
         parts.append("## Bars\n\n" + _bars(result["bars"]))
     parts += [_simulated(name, table) for name, table in result["tables"].items() if table]
@@ -84,6 +86,24 @@ def _table(table: dict[str, Any]) -> str:
         cells += [_both(ours, "at_scans_m", "at_scans_deg"), _both(ours, "best_possible_m", "best_possible_deg")]
         body.append([f"`{change}`", *cells])
     return markdown(head, body)
+
+
+_ABLATION = """## What each part of the front end brings
+
+Errors (m, deg) without one part of it: a hypothesis of the motion, or a step. The first row has all of them."""
+
+
+def _ablation(table: dict[str, Any]) -> str:
+    ablated = {change: rows for change, rows in table.items() if any(row.startswith("without_") for row in rows)}
+    names = dict.fromkeys(row for rows in ablated.values() for row in rows if row.startswith("without_"))
+    body = [
+        [
+            row.replace("_", " "),
+            *(_both(rows.get(row, {}), "translation_m", "rotation_deg") for rows in ablated.values()),
+        ]
+        for row in ("ours", *names)
+    ]
+    return markdown(["", *(f"`{change}`" for change in ablated)], body)
 
 
 def _both(numbers: dict[str, Any], metres: str, degrees: str) -> str:

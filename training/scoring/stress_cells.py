@@ -15,7 +15,7 @@ from training.data.lidar_drives import Relations
 from training.data.sensor_log import SensorLog
 from training.recordings import lidar_logs
 from training.recordings.lidar_logs import log_drive, log_identity, read_relations, relations_of
-from training.scoring.lidar_rows import ROWS, DriveRuns, Estimate, identity_of
+from training.scoring.lidar_rows import FRONT_ABLATION, ROWS, DriveRuns, Estimate, identity_of
 from training.scoring.lidar_scores import weights_digest
 from training.scoring.relations import interpolated, relation_errors
 from training.scoring.table import Drive, Measured, Row, measure
@@ -27,6 +27,7 @@ AT_SCANS_S = 0.02
 """A relation is at a scan where one was taken so close to each of its ends."""
 
 _CODE = (lidar_changes, lidar_logs)
+_ROWS = ROWS | FRONT_ABLATION
 
 
 class StressLog:
@@ -77,7 +78,7 @@ class StressLog:
         return log, DriveRuns(log.drive(f"{self.name}, {change}, {seed}", "", self.relations), self._weights)
 
     def _row(self, name: str) -> Row:
-        row = ROWS[name]
+        row = _ROWS[name]
         identity = json.dumps([identity_of(row.settings), weights_digest(row, self._weights)])
         return Row(partial(_cell, name=name), identity, row.code)
 
@@ -85,7 +86,7 @@ class StressLog:
 def _cell(made: tuple[SensorLog, DriveRuns], name: str) -> Measured:
     log, runs = made
     try:
-        found = ROWS[name].estimate(runs)
+        found = _ROWS[name].estimate(runs)
     except ValueError as error:
         return cell_of(log.taken_ns[:0], np.zeros((0, 3)), log.taken_ns, failed=str(error))
     assert isinstance(found, Estimate)  # only rows of wrong loops have several

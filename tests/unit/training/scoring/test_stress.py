@@ -9,6 +9,7 @@ import pytest
 
 from ngo_estimator.geometry.planar_motion import all_between, compose
 from training.data.lidar_drives import Relations
+from training.results_stress import with_earlier
 from training.scoring import stress_cells
 from training.scoring.lidar_bars import stress_bars
 from training.scoring.lidar_rows import DriveRuns, Estimate, Row
@@ -57,6 +58,16 @@ def test_the_best_possible_is_the_clean_solution_between_the_scans_that_were_kep
     assert cell_numbers(RELATIONS, seen, cell_of(TAKEN, bent, TAKEN))["best_possible_m"] < 0.34
 
 
+def test_cells_that_are_published_stay_until_they_are_measured_anew() -> None:
+    published = {"aces": {"clean": {"ours": {"m": 2.0}, "kiss_icp": {"m": 3.0}}, "people": {"ours": {"m": 4.0}}}}
+    measured = {"aces": {"clean": {"ours": {"m": 1.0}}}, "csail": {"clean": {"ours": {"m": 5.0}}}}
+    found = with_earlier(measured, published, "old")
+    assert found["aces"]["clean"] == {"ours": {"m": 1.0}, "kiss_icp": {"revision": "old", "m": 3.0}}
+    assert found["aces"]["people"] == {"ours": {"revision": "old", "m": 4.0}}
+    assert found["csail"] == {"clean": {"ours": {"m": 5.0}}}
+    assert with_earlier({}, found, "new")["aces"]["clean"]["kiss_icp"]["revision"] == "old"
+
+
 def flaser(k: int) -> str:
     ranges = " ".join(f"{2.0 + 0.01 * ray:.2f}" for ray in range(180))
     pose = f"{0.1 * k:.2f} 0.0 0.0"
@@ -85,7 +96,7 @@ def test_a_cell_is_measured_once_and_at_the_times_when_scans_were_taken(
         raise ValueError("no scan fits")
 
     rows = {"ours": Row(estimate, None, code=()), "kiss_icp": Row(fails, None, code=())}
-    monkeypatch.setattr(stress_cells, "ROWS", rows)
+    monkeypatch.setattr(stress_cells, "_ROWS", rows)
     log = StressLog(write_log(tmp_path), tmp_path, tmp_path / "cache")
     assert log.cells("scans_bunched", 0, rows, known_only=True) == {}
     for _ in range(2):
@@ -111,7 +122,7 @@ def test_rows_without_wheels_see_no_change_of_them(tmp_path: Path, monkeypatch: 
         return Estimate(runs.drive.scan_stamps_ns, np.zeros((len(runs.drive.scans), 3)))
 
     rows = dict.fromkeys(("ours", "ours_without_wheels"), Row(estimate, None, code=()))
-    monkeypatch.setattr(stress_cells, "ROWS", rows)
+    monkeypatch.setattr(stress_cells, "_ROWS", rows)
     log = StressLog(write_log(tmp_path), tmp_path, tmp_path / "cache")
     for change, seed in (("clean", 0), ("clean", 1), ("wheels_spin", 1)):
         assert list(log.cells(change, seed, rows)) == list(rows)

@@ -3,6 +3,7 @@
 import math
 
 import numpy as np
+import pytest
 
 from ngo_estimator.frontend.lidar.mixture_config import MixtureConfig
 from ngo_estimator.frontend.lidar.motion_mixture import ANY, LAST, LOOSE, NONE, TIGHT, VELOCITY, MotionMixture
@@ -95,3 +96,14 @@ def test_dead_reckoning_has_the_covariance_of_all_hypotheses() -> None:
     others = mixture.weights[[LAST, VELOCITY, NONE]].sum()
     assert pose[2] == 1.5
     assert covariance[2, 2] > others * 1.5**2
+
+
+def test_a_hypothesis_of_no_weight_is_not_formed_and_anything_stays() -> None:
+    mixture = MotionMixture(MixtureConfig(first_weights=(0.0, 0.6, 0.0, 0.2, 0.1, 0.1)))
+    mixture.foretell(0.0, np.array((0.1, 0.0, 0.0)), np.array((0.1, 0.0, 0.0)), 1.0)
+    assert mixture.usable == [1, 3, 4, 5]
+    mixture.learn(np.array((0.1, 0.0, 0.0)), 1e-6 * np.eye(3))
+    mixture.foretell(0.0, None, None, 1.0)
+    assert mixture.usable == [3, 4, 5]
+    with pytest.raises(ValueError, match="first_weights"):
+        MixtureConfig(first_weights=(0.5, 0.1, 0.1, 0.1, 0.2, 0.0))

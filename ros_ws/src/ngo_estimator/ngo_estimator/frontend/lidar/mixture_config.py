@@ -16,7 +16,7 @@ class MixtureConfig:
     """Settings of the front end; see the comment of each."""
 
     # Hypotheses of a motion: wheels that are good, wheels that are poor, the last displacement, the last velocity,
-    # none, anything.
+    # none, anything. One of the weight 0, but not anything, is left out.
     first_weights: tuple[float, ...] = (0.45, 0.2, 0.1, 0.15, 0.07, 0.03)
     first_factors: tuple[float, ...] = (0.5, 2.0, 3.0, 2.0, 3.0, 1.0)  # on the deviations below
     least_factors: tuple[float, ...] = (0.1, 1.0, 0.5, 0.3, 0.5, 1.0)
@@ -76,7 +76,8 @@ class MixtureConfig:
 
     def __post_init__(self) -> None:
         for name, value in vars(self).items():
-            if not _positive(value):
+            may_be_zero = name == "first_weights" and value[-1] > 0.0 and all(0.0 <= each < math.inf for each in value)
+            if not (may_be_zero or _positive(value)):
                 raise ValueError(f"{name} is {value}; expected positive numbers")
         if not all(len(each) == 6 for each in (self.first_weights, self.first_factors, self.least_factors)):
             raise ValueError(
