@@ -17,7 +17,6 @@ from ngo_estimator.checkpoint import LOCAL, OPTIMIZER, PLACE, SMOOTHER
 from ngo_estimator.data.weights_file import load_description
 from training import (
     featurise,
-    throughput,
     train_deepvo,
     train_end_to_end,
     train_local,
@@ -27,7 +26,6 @@ from training import (
     tune_pose_graph,
 )
 from training.baselines.deepvo import DEEPVO
-from training.common.records import write_at_once
 from training.data.data_source import TRAIN_STORE
 from training.data.feature_store import open_store
 from training.scoring.network_odometry import make_odometry, open_odometry
@@ -44,7 +42,6 @@ class Scripts:
     optimizer: train_optimizer.Arguments = field(default_factory=lambda: train_optimizer.Arguments(world="maze2d"))
     smoother: train_smoother.Arguments = field(default_factory=lambda: train_smoother.Arguments(world="maze3d"))
     pose_graph: tune_pose_graph.Arguments = field(default_factory=lambda: tune_pose_graph.Arguments(world="maze2d"))
-    speed: throughput.Arguments = field(default_factory=lambda: throughput.Arguments(world="maze2d"))
     deepvo: train_deepvo.Arguments = field(default_factory=lambda: train_deepvo.Arguments(world="maze3d"))
     end_to_end: train_end_to_end.Arguments = field(default_factory=lambda: train_end_to_end.Arguments(world="maze2d"))
 
@@ -77,7 +74,6 @@ def prepare(sources: Sources, wanted: Wanted, scripts: Scripts) -> None:
         *_optimizers(sources, wanted, scripts),
         *_end_to_end(sources, wanted, scripts),
         *_own_odometry(sources, wanted, scripts),
-        Step("a measurement of how fast data is made", sources.speed_file.exists, lambda: _speed(sources, scripts)),
     ):
         if not step.is_there():
             print(f"{sources.world.name}: {step.what} is missing and is made now", flush=True)
@@ -194,12 +190,6 @@ def _own_odometry(sources: Sources, wanted: Wanted, scripts: Scripts) -> Iterato
             store = own.store_folder(wanted.split, table)
             make = partial(make_odometry, row, sources, wanted.split, table, wanted.trajectories)
             yield Step(f"the odometry of {row} in {store.name}", _is_whole(partial(open_odometry, store)), make)
-
-
-def _speed(sources: Sources, scripts: Scripts) -> None:
-    world: Any = sources.world.name
-    speed = throughput.main(replace(scripts.speed, world=world))
-    write_at_once(sources.speed_file, json.dumps(speed) + "\n")
 
 
 def _exists(sources: Sources, kind: str) -> Callable[[], bool]:

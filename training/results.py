@@ -181,7 +181,6 @@ def summary(
             name: tables.path_json(arrays["truth"], sorted({*prefixes, steps})) for name, arrays in stores.items()
         },
         "attention": {name: attention.attention_json(sources, arrays) for name, arrays in few.items()},
-        "data_generation": json.loads(sources.speed_file.read_text()),
         "trainings": trainings_json(sources, arguments.seeds),
     }
 

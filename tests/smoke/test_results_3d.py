@@ -13,7 +13,6 @@ from tests.smoke import toy
 from training import (
     featurise,
     results,
-    throughput,
     train_deepvo,
     train_end_to_end,
     train_local,
@@ -69,9 +68,6 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Any:
         for module in (figures, attention_map):
             patch.setattr(module, "maze_and_start", drawn_once)
         patch.setattr(tune_pose_graph, "GRID", tune_pose_graph.GRID[3:4])  # one group, as the unit tests try the rest
-        speed = toy.sources("maze3d", folder).speed_file
-        speed.parent.mkdir(parents=True)
-        speed.write_text('{"workers": 1, "local_datapoints_per_s": 1000.0}')
         yield folder, results.main(arguments(folder), toy.scripts("maze3d", folder))
 
 
@@ -128,7 +124,7 @@ def test_the_optimizer_learns_from_the_other_driver_and_the_smoother_does_not(
 def test_nothing_is_made_twice(made: tuple[Path, dict[str, Any]], monkeypatch: pytest.MonkeyPatch) -> None:
     folder, result = made
     networks = (train_deepvo, train_end_to_end, train_local, train_optimizer, train_place, train_smoother)
-    scripts = (*networks, featurise, throughput, tune_pose_graph)
+    scripts = (*networks, featurise, tune_pose_graph)
     calls = ("training.prerequisites.make_odometry", "training.scoring.prefix_errors.scores")
     toy.refuse(monkeypatch, scripts, *calls)
     assert results.main(arguments(folder), toy.scripts("maze3d", folder)) == result

@@ -34,7 +34,6 @@ from tests.smoke import toy
 from training import (
     evaluate,
     featurise,
-    throughput,
     train_deepvo,
     train_end_to_end,
     train_local,
@@ -248,13 +247,3 @@ def test_two_processes_train_on_mazes_of_their_own_to_the_same_weights(two_proce
     training = load_local(weights.parent)[1]["training"]
     assert training["processes"] == 2
     assert training["command"].startswith("python -m training.train_local --accelerator cpu --devices 2 --strategy ddp")
-
-
-def test_the_speed_of_making_data_is_measured(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    toy.shrink(monkeypatch, 161, 300)
-    table = throughput.main(toy.speed("maze2d"))
-    assert json.loads(capsys.readouterr().out.splitlines()[-1]) == {"world": "maze2d", **table}
-    assert {"local", "place", "trajectories"} == {n.removesuffix("_datapoints_per_s") for n in table if "_per_s" in n}
-    assert min(table[name] for name in table if name.endswith("_per_s")) > 0.0

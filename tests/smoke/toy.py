@@ -14,7 +14,6 @@ from training import (
     featurise,
     prerequisites,
     results,
-    throughput,
     train_deepvo,
     train_end_to_end,
     train_local,
@@ -133,10 +132,6 @@ def end_to_end(world: str, folder: Path, epochs: int = 1) -> train_end_to_end.Ar
     )
 
 
-def speed(world: str) -> throughput.Arguments:
-    return throughput.Arguments(world=world, workers=0, seconds=0.1)
-
-
 def evaluation(world: str, folder: Path) -> evaluate.Arguments:
     return evaluate.Arguments(world=world, trajectories=2, frames=60, weights=folder / "weights")
 
@@ -150,7 +145,6 @@ def scripts(world: Any, folder: Path) -> prerequisites.Scripts:
         smoother=smoother(world, folder),
         optimizer=optimizer(world, folder),
         pose_graph=tune_pose_graph.Arguments(world=world, trajectories=2, passes=1),
-        speed=speed(world),
         deepvo=deepvo("maze3d", folder),
         end_to_end=end_to_end(world, folder),
     )

@@ -47,7 +47,6 @@ def page(result: dict[str, Any], images: dict[str, str], world: World) -> str:
         "Time is what went into the weights; throughput and memory are of all processes together. Data are "
         "simulated while the networks train, so that throughput is of both.",
         _trainings(result["trainings"]),
-        _generation(result["data_generation"]),
     ]
     return whole(parts)
 
@@ -134,19 +133,6 @@ def _trainings(trainings: dict[str, Any]) -> str:
 
     header = ["Network", "Time", "Datapoints", "Peak memory", "Command"]
     return markdown(header, (cells(name, entry) for name, entry in trainings.items()))
-
-
-def _generation(speed: dict[str, float]) -> str:
-    """How fast data is made without a training, if that was measured."""
-    suffix = "_datapoints_per_s"
-    made = [f"{name.removesuffix(suffix)} {value:,.0f}" for name, value in speed.items() if name.endswith(suffix)]
-    if not made:
-        return ""
-    memory = _unit(speed, "peak_memory_mb", 1.0 / 1024.0, "GiB")
-    return (
-        "Data alone (`python -m training.throughput`), datapoints/s with "
-        f"{speed['workers']:.0f} worker process(es): {joined(made)}; peak memory {memory}."
-    )
 
 
 def _unit(entry: dict[str, Any], key: str, factor: float, unit: str) -> str:

@@ -98,11 +98,6 @@ class Sources:
         """The pose graph's settings in one of its ``tune_pose_graph.FORMS``, tuned on validation."""
         return self.results / f"{self.world.name}.gtsam{'' if form == 'loops' else f'_{form}'}.json"
 
-    @property
-    def speed_file(self) -> Path:
-        """How fast data is made, as measured once."""
-        return self.runs / self.world.name / "results" / "throughput.json"
-
     def of_row(self, row: str, seed: int) -> "Sources":
         """The sources of a row with networks and features of its own."""
         folder = self.row_folder(row, seed)

@@ -72,7 +72,6 @@ def result() -> dict[str, object]:
         "path_m": {"perfect": {"4": 10.0, "8": 20.0}},
         "attention": {},
         "trainings": {"ngo_5-seed0": {"command": "python -m x", "seconds": 90.0, "datapoints_per_s": 12.5}},
-        "data_generation": {"workers": 1, "local_datapoints_per_s": 4321.0, "peak_memory_mb": 512.0},
     }
 
 
@@ -89,7 +88,6 @@ def test_the_page_has_what_the_json_has() -> None:
     assert "![What it shows.](images/a.png)" in text
     assert "| `ngo_5-seed0` | 1.50 min | 12.5 /s |  | `python -m x` |" in lines
     assert "seeds 0 and 1" in text
-    assert "with 1 worker process(es): local 4,321; peak memory 0.500 GiB." in text
 
 
 @pytest.mark.parametrize("index", [1, GROUP + 1])
