@@ -8,6 +8,7 @@ import pytest
 
 from tests.unit.ngo_estimator.rendered_room import camera
 from training import results_camera
+from training.scoring import camera_rows
 
 pytestmark = pytest.mark.slow
 
@@ -16,20 +17,20 @@ pytestmark = pytest.mark.slow
 def test_an_ablation_has_a_file_of_its_own(without: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(results_camera._MAPS, "test", (("take_cover.wad", "MAP01"),))
     (drive,) = results_camera.main(
-        results_camera.Arguments(frames=24, without=without, results=tmp_path)  # type: ignore[arg-type]
+        results_camera.Arguments(frames=24, without=without, results=tmp_path, runs=tmp_path / "runs")  # type: ignore[arg-type]
     )["drives"].values()
-    assert [path.name for path in tmp_path.iterdir()] == [f"camera.no_{without}.json"]
+    assert [path.name for path in tmp_path.glob("*.json")] == [f"camera.no_{without}.json"]
     assert (drive["odometry_ate_m"] == pytest.approx(drive["given_ate_m"])) == (without == "tracks")
-    odometry, graph = results_camera.estimators(camera(), without)
-    assert isinstance(odometry._describer, results_camera._Orb) == (without == "sift")
-    assert isinstance(graph._new_back_end()._corrector, results_camera._Believes) == (without == "corrector")
+    odometry, graph = camera_rows.estimators(camera(), without)
+    assert isinstance(odometry._describer, camera_rows._Orb) == (without == "sift")
+    assert isinstance(graph._new_back_end()._corrector, camera_rows._Believes) == (without == "corrector")
 
 
 def test_a_short_drive_on_a_map(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(results_camera._MAPS, "test", (("take_cover.wad", "MAP01"),))
-    arguments = results_camera.Arguments(frames=24, seeds=2, results=tmp_path)
+    arguments = results_camera.Arguments(frames=24, seeds=2, results=tmp_path, runs=tmp_path / "runs")
     result = results_camera.main(arguments)
-    monkeypatch.setattr(results_camera, "measured", None)
+    monkeypatch.setattr(results_camera, "camera_drive", pytest.fail)
     assert results_camera.main(arguments)["drives"] == result["drives"]  # they are not measured again
     drive, other = result["drives"].values()
     assert all(np.isfinite(value) for value in drive.values()) and drive["path_m"] > 0.0
