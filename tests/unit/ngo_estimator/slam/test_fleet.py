@@ -66,6 +66,10 @@ def test_robots_that_meet_share_a_map_and_one_elsewhere_has_its_own(monkeypatch:
     assert off_m(fleet, "red", FIRST[0], FIRST[:61]) < 0.1
     assert off_m(fleet, "blue", FIRST[0], BACK[:61]) < 0.1
     assert off_m(fleet, "green", ALIKE[0], ALIKE[: len(told["green"]) + 1]) < 0.1
+    graph = fleet.planar_graph()
+    assert graph is not None
+    of_red = graph.ids[fleet.core.back_end.graph.stream_of(graph.ids) == 0][:61]
+    np.testing.assert_allclose(graph.poses[of_red], between(FIRST[:1], FIRST[:61]), atol=0.1)
     for robot in robots():
         pose, covariance = fleet.pose(robot)
         assert 1e-3 < position_std(covariance) < 0.4

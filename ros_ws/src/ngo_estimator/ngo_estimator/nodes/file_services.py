@@ -1,11 +1,11 @@
 """The services that write and read files: the trajectory, and all that a trajectory goes on with."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
 from ngo_msgs.srv import LoadState, SaveGraph, SaveState, SaveTrajectory
 from rclpy.callback_groups import MutuallyExclusiveCallbackGroup
@@ -13,8 +13,8 @@ from rclpy.node import Node
 from rclpy.qos import QoSProfile
 from rclpy.task import Future
 
-from ngo_estimator.trajectory.files import ENDINGS, tum_lines, write_lines, write_trajectory
-from ngo_estimator.trajectory.g2o import GRAPH_ENDING, g2o_lines, write_g2o
+from ngo_estimator.trajectory.files import ENDINGS, trajectory_lines, write_lines
+from ngo_estimator.trajectory.g2o import GRAPH_ENDING, g2o_lines
 from ngo_estimator.trajectory.save_path import folder_inside, path_inside
 
 if TYPE_CHECKING:
@@ -26,47 +26,99 @@ if TYPE_CHECKING:
     from ngo_estimator.trajectory.g2o import PlanarGraph
 
     Loaded = tuple[Session, MapLocalisation | Joining | None]
+    Trajectories = Mapping[str, Trajectory]
 
 Result = TypeVar("Result")
 
 
 class FileServices:
-    """Answers ``~/save_trajectory``, ``~/save_graph``, ``~/save_state`` and ``~/load_state``.
+    """Answers ``~/save_trajectory`` and ``~/save_graph``.
 
-    Files are written and read in a thread, while relative poses go on.
+    Files are written in a thread, while relative poses go on.
     """
 
     def __init__(
         self,
         node: Node,
         settings: "NgoNodeSettings",
-        trajectory: "Callable[[], Trajectory | None]",
+        trajectories: "Callable[[], Trajectories]",
         graph: "Callable[[], PlanarGraph | None]",
-        session: "Callable[[], Session]",
-        take: "Callable[[Loaded], None]",
     ) -> None:
-        """Save ``trajectory()``, ``graph()`` and ``session()``, and hand a loaded session to ``take``.
+        """Save ``trajectories()`` and ``graph()``; paths lie in the folder of the ``settings``.
 
-        Paths lie in the folder of the ``settings``. With a session comes the search for the robot in its map: if they
-        say localization, or the session goes on from another start.
+        Names of trajectories stand before the ending of the file's name; that of a single one is empty.
         """
         self._node, self._settings, self._folder = node, settings, Path(settings.save_directory)
-        self._trajectory, self._graph, self._session, self._take = trajectory, graph, session, take
-        self._newest = self._folder  # the state that was loaded or saved last
+        self._trajectories, self._graph = trajectories, graph
 
     def open(self, qos: QoSProfile, built: ExitStack) -> None:
         """Offer the services, until ``built`` is closed."""
         self._thread = built.enter_context(ThreadPoolExecutor(1))
-        for kind, name, callback in (
-            (SaveTrajectory, "~/save_trajectory", self._on_save_trajectory),
-            (SaveGraph, "~/save_graph", self._on_save_graph),
-            (SaveState, "~/save_state", self._on_save_state),
-            (LoadState, "~/load_state", self._on_load_state),
-        ):
+        for kind, name, callback in self._services():
             # A group of its own: while a file is written, the others go on.
             group = MutuallyExclusiveCallbackGroup()
             service = self._node.create_service(kind, name, callback, qos_profile=qos, callback_group=group)
             built.callback(self._node.destroy_service, service)
+
+    def _services(self) -> Iterator[tuple[Any, str, Callable[..., Any]]]:
+        yield SaveTrajectory, "~/save_trajectory", self._on_save_trajectory
+        yield SaveGraph, "~/save_graph", self._on_save_graph
+
+    async def _on_save_trajectory(
+        self, request: SaveTrajectory.Request, response: SaveTrajectory.Response
+    ) -> SaveTrajectory.Response:
+        trajectories, folder = self._trajectories(), self._folder
+        graph = self._graph() if request.path.endswith(GRAPH_ENDING) else None
+        write = partial(_write, trajectories=trajectories, graph=graph)
+        response.success, response.message = await self._aside(lambda: _written(request.path, folder, write))
+        return response
+
+    async def _on_save_graph(self, request: SaveGraph.Request, response: SaveGraph.Response) -> SaveGraph.Response:
+        write = partial(_write_graph, trajectories=self._trajectories(), graph=self._graph())
+        response.success, response.message = await self._aside(lambda: _written(request.path, self._folder, write))
+        return response
+
+    async def _aside(self, work: Callable[[], Result]) -> Result:
+        """The result of work that is done in a thread, or its error."""
+        done, executor = Future(), self._node.executor
+
+        def run() -> None:
+            try:
+                done.set_result(work())
+            except Exception as error:
+                done.set_exception(error)
+            executor.wake()
+
+        self._thread.submit(run)
+        result: Result = await done
+        return result
+
+
+class StateServices(FileServices):
+    """Answers ``~/save_state`` and ``~/load_state`` as well."""
+
+    def __init__(
+        self,
+        node: Node,
+        settings: "NgoNodeSettings",
+        trajectories: "Callable[[], Trajectories]",
+        graph: "Callable[[], PlanarGraph | None]",
+        session: "Callable[[], Session]",
+        take: "Callable[[Loaded], None]",
+    ) -> None:
+        """Save ``session()`` as well, and hand a loaded session to ``take``.
+
+        With a session comes the search for the robot in its map: if the ``settings`` say localization, or the session
+        goes on from another start.
+        """
+        super().__init__(node, settings, trajectories, graph)
+        self._session, self._take = session, take
+        self._newest = self._folder  # the state that was loaded or saved last
+
+    def _services(self) -> Iterator[tuple[Any, str, Callable[..., Any]]]:
+        yield from super()._services()
+        yield SaveState, "~/save_state", self._on_save_state
+        yield LoadState, "~/load_state", self._on_load_state
 
     def load_at_start(self, path: str, relocalise: bool) -> None:
         """Load the state in a folder that the parameters name; raises ``ValueError``, of one line."""
@@ -82,20 +134,6 @@ class FileServices:
         if self._settings.keeps_map:
             return session, session.localisation()
         return session, session.joining() if relocalise or self._settings.mode == "localization" else None
-
-    async def _on_save_trajectory(
-        self, request: SaveTrajectory.Request, response: SaveTrajectory.Response
-    ) -> SaveTrajectory.Response:
-        trajectory, folder = self._trajectory(), self._folder
-        graph = self._graph() if request.path.endswith(GRAPH_ENDING) else None
-        write = partial(_write, trajectory=trajectory, graph=graph)
-        response.success, response.message = await self._aside(lambda: _written(request.path, folder, write))
-        return response
-
-    async def _on_save_graph(self, request: SaveGraph.Request, response: SaveGraph.Response) -> SaveGraph.Response:
-        write = partial(_write_graph, trajectory=self._trajectory(), graph=self._graph())
-        response.success, response.message = await self._aside(lambda: _written(request.path, self._folder, write))
-        return response
 
     async def _on_save_state(self, request: SaveState.Request, response: SaveState.Response) -> SaveState.Response:
         """Save what the trajectory is at this moment."""
@@ -123,21 +161,6 @@ class FileServices:
             response.message = str(error)
         return response
 
-    async def _aside(self, work: Callable[[], Result]) -> Result:
-        """The result of work that is done in a thread, or its error."""
-        done, executor = Future(), self._node.executor
-
-        def run() -> None:
-            try:
-                done.set_result(work())
-            except Exception as error:
-                done.set_exception(error)
-            executor.wake()
-
-        self._thread.submit(run)
-        result: Result = await done
-        return result
-
 
 def _relocalises(mode: int) -> bool:
     """Whether a mode asks for the robot to be found in the map; raises ``ValueError`` for one that there is not."""
@@ -155,26 +178,37 @@ def _written(name: str, folder: Path, write: Callable[[Path], str]) -> tuple[boo
         return False, " ".join(str(error).split()) or repr(error)
 
 
-def _write(path: Path, trajectory: "Trajectory | None", graph: "PlanarGraph | None") -> str:
-    """Write the trajectory, or where the ending says so its graph; returns what was written."""
-    if trajectory is None:
+def _write(path: Path, trajectories: "Trajectories", graph: "PlanarGraph | None") -> str:
+    """Write the trajectories, or where the ending says so their graph; returns what was written."""
+    if not trajectories:
         raise ValueError("the trajectory is empty; nothing was written")
     if path.suffix not in (*ENDINGS, GRAPH_ENDING):
         raise ValueError(f"file is '{path}'; allowed: a name that ends in {', '.join(ENDINGS)} or {GRAPH_ENDING}")
     if graph is not None:
-        write_g2o(path, graph)
+        write_lines({path: g2o_lines(graph)})
         return f"wrote {len(graph.ids)} poses to {path}"
-    write_trajectory(path, trajectory.stamps_ns, trajectory.poses_xyyaw)
-    return f"wrote {len(trajectory.stamps_ns)} poses to {path}"
+    lines, said = _lines_of(path, trajectories)
+    write_lines(lines)
+    return f"wrote {said}"
 
 
-def _write_graph(path: Path, trajectory: "Trajectory | None", graph: "PlanarGraph | None") -> str:
-    """Write the graph, and the trajectory beside it; returns what was written."""
-    if trajectory is None or graph is None:
+def _write_graph(path: Path, trajectories: "Trajectories", graph: "PlanarGraph | None") -> str:
+    """Write the graph, and the trajectories beside it; returns what was written."""
+    if not trajectories or graph is None:
         raise ValueError("the trajectory is empty; nothing was written")
     if path.suffix != GRAPH_ENDING:
         raise ValueError(f"path is '{path}'; expected a name that ends in {GRAPH_ENDING}")
-    beside = path.with_suffix(".tum")
-    write_lines({path: g2o_lines(graph), beside: tum_lines(trajectory.stamps_ns, trajectory.poses_xyyaw)})
-    loops, poses = int(graph.is_loop.sum()), len(trajectory.stamps_ns)
-    return f"wrote {len(graph.ids)} vertices and {loops} loops to {path}, and {poses} poses to {beside}"
+    lines, said = _lines_of(path.with_suffix(".tum"), trajectories)
+    write_lines({path: g2o_lines(graph), **lines})
+    return f"wrote {len(graph.ids)} vertices and {int(graph.is_loop.sum())} loops to {path}, and {said}"
+
+
+def _lines_of(path: Path, trajectories: "Trajectories") -> tuple[dict[Path, Iterator[str]], str]:
+    """The lines of the files of all trajectories, and what they hold in words."""
+    lines: dict[Path, Iterator[str]] = {}
+    said = []
+    for name, trajectory in trajectories.items():
+        own = path.with_stem(f"{path.stem}_{name}") if name else path
+        lines |= trajectory_lines(own, trajectory.stamps_ns, trajectory.poses_xyyaw)
+        said.append(f"{len(trajectory.stamps_ns)} poses to {own}")
+    return lines, ", ".join(said)

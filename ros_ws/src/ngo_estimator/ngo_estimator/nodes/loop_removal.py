@@ -9,13 +9,27 @@ from ngo_msgs.srv import RemoveLoop
 from ngo_estimator.nodes.messages import to_ns
 
 if TYPE_CHECKING:  # brings torch, which takes seconds: nodes import it after checking their parameters
+    from rclpy.impl.rcutils_logger import RcutilsLogger
+
     from ngo_estimator.slam.corrected_trajectory import CorrectedTrajectory
-    from ngo_estimator.trajectory.g2o import PlanarGraph
 
 _NS = 1e-9
 
 
-def remove_loops(core: "CorrectedTrajectory", request: RemoveLoop.Request) -> str:
+def remove_loops(
+    core: "CorrectedTrajectory", request: RemoveLoop.Request, response: RemoveLoop.Response, logger: "RcutilsLogger"
+) -> bool:
+    """Take out what a request names, and answer; returns whether loops are out."""
+    try:
+        response.message, response.success = _removed(core, request), True
+    except ValueError as error:
+        response.message = str(error)
+        return False
+    logger.info(f"as it was told: {response.message}")
+    return True
+
+
+def _removed(core: "CorrectedTrajectory", request: RemoveLoop.Request) -> str:
     """Take out what a request names; returns a message for the user, or raises ``ValueError`` with one."""
     graph, trajectory = core.planar_graph(), core.trajectory()
     if graph is None or trajectory is None:
@@ -23,31 +37,33 @@ def remove_loops(core: "CorrectedTrajectory", request: RemoveLoop.Request) -> st
     if request.what not in (RemoveLoop.Request.LOOP, RemoveLoop.Request.STRETCH):
         raise ValueError(f"what is {request.what}; expected 0 (LOOP) or 1 (STRETCH)")
     named = ((request.first_id, request.first), (request.second_id, request.second))
-    stamps = [_stamp_ns(graph, trajectory.stamps_ns, name, stamp) for name, stamp in named]
-    first, second = np.searchsorted(trajectory.stamps_ns, stamps).tolist()
+    first, second = (_frame(core.vertices, trajectory.stamps_ns, name, stamp) for name, stamp in named)
     stretch = request.what == RemoveLoop.Request.STRETCH
     removed = core.remove_loops(first, second, stretch)
     if removed == 0:
-        joined = graph.stamps_ns[graph.edges[graph.is_loop]]
+        joined, stamps = graph.stamps_ns[graph.edges[graph.is_loop]], trajectory.stamps_ns[[first, second]]
         raise ValueError(f"no loop {'ends there' if stretch else 'joins these poses'}; {_nearest(joined, stamps)}")
     if core.fault:
         raise ValueError(f"{removed} loops are out, but {core.fault}")
     return f"{removed} loops are out; {int(graph.is_loop.sum()) - removed} stay"
 
 
-def _stamp_ns(graph: "PlanarGraph", stamps_ns: np.ndarray, name: int, stamp: Time) -> int:
+def _frame(vertices: np.ndarray, stamps_ns: np.ndarray, name: int, stamp: Time) -> int:
     if name >= 0:
-        if name >= len(graph.ids):
-            raise ValueError(f"there is no vertex {name}; expected 0 to {len(graph.ids) - 1}")
-        return int(graph.stamps_ns[name])
+        if name >= len(vertices):
+            raise ValueError(f"there is no vertex {name}; expected 0 to {len(vertices) - 1}")
+        return int(vertices[name])
     given = to_ns(stamp)
-    nearest = int(stamps_ns[np.abs(stamps_ns - given).argmin()])
-    if nearest != given:
+    frames = np.flatnonzero(stamps_ns == given)
+    if len(frames) == 0:
+        nearest = int(stamps_ns[np.abs(stamps_ns - given).argmin()])
         raise ValueError(f"no pose has the stamp {given * _NS:.9f}; the nearest one is at {nearest * _NS:.9f}")
-    return given
+    if len(frames) > 1:
+        raise ValueError(f"{len(frames)} poses have the stamp {given * _NS:.9f}; expected an id, as save_graph has it")
+    return int(frames[0])
 
 
-def _nearest(joined: np.ndarray, stamps: list[int]) -> str:
+def _nearest(joined: np.ndarray, stamps: np.ndarray) -> str:
     if len(joined) == 0:
         return "the graph has none"
     first, second = joined[np.abs(np.sort(joined, axis=1) - np.sort(stamps)).max(axis=1).argmin()].tolist()

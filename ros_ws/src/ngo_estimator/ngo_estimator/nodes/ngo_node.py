@@ -21,7 +21,7 @@ from ngo_common.settings import usage
 from ngo_estimator.geometry.planar_covariance import position_std
 from ngo_estimator.nodes import messages
 from ngo_estimator.nodes.code_memory import release_code
-from ngo_estimator.nodes.file_services import FileServices
+from ngo_estimator.nodes.file_services import StateServices
 from ngo_estimator.nodes.inputs import Input
 from ngo_estimator.nodes.loop_removal import remove_loops
 from ngo_estimator.nodes.managed_node import ManagedNode
@@ -112,10 +112,10 @@ class NgoNode(ManagedNode):
         self._begin_anew()
         self._configured = True
         built.callback(setattr, self, "_configured", False)
-        self._files = files = FileServices(
+        self._files = files = StateServices(
             self,
             settings,
-            self._trajectory,
+            self._trajectories,
             self._graph,
             self._session,
             self._take,
@@ -348,24 +348,22 @@ class NgoNode(ManagedNode):
         trajectory = self._core.trajectory()
         return trajectory and replace(trajectory, poses_xyyaw=self._origin.poses(trajectory.poses_xyyaw))
 
+    def _trajectories(self) -> "dict[str, Trajectory]":
+        trajectory = self._trajectory()
+        return {} if trajectory is None else {"": trajectory}
+
     def _graph(self) -> "PlanarGraph | None":
         """The graph, with its poses in map."""
         graph = self._core.planar_graph()
         return graph and replace(graph, poses=self._origin.poses(graph.poses))
 
     def _on_remove_loop(self, request: RemoveLoop.Request, response: RemoveLoop.Response) -> RemoveLoop.Response:
-        try:
-            if self._search is not None:
-                raise ValueError("the robot is looked for in the map, which stays as it is; no loop was taken out")
-            response.message = remove_loops(self._core, request)
-            response.success = True
-        except ValueError as error:
-            response.message = str(error)
-            return response
-        self.get_logger().info(f"as it was told: {response.message}")
-        self._on_correction(self._core.newest())
-        if self._inputs:
-            self._pending.reset()
+        if self._search is not None:
+            response.message = "the robot is looked for in the map, which stays as it is; no loop was taken out"
+        elif remove_loops(self._core, request, response, self.get_logger()):
+            self._on_correction(self._core.newest())
+            if self._inputs:
+                self._pending.reset()
         return response
 
     def _on_initial_pose(self, message: PoseWithCovarianceStamped) -> None:

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from ngo_msgs.msg import RelativePose
-from ngo_msgs.srv import Reset
+from ngo_msgs.srv import RemoveLoop, Reset
 from rclpy.clock import Clock, ClockType
 from rclpy.lifecycle import LifecycleNode
 from rclpy.qos import QoSProfile
@@ -18,7 +18,9 @@ from ngo_common.nodes.process import StartError
 from ngo_common.nodes.qos import checked_overrides
 from ngo_estimator.geometry.planar_covariance import position_std
 from ngo_estimator.nodes import messages
+from ngo_estimator.nodes.file_services import FileServices
 from ngo_estimator.nodes.inputs import Input
+from ngo_estimator.nodes.loop_removal import remove_loops
 from ngo_estimator.nodes.pose_publisher import PosePublisher
 from ngo_estimator.nodes.settings import TOPICS_OF_ROBOTS, NgoNodeSettings, of_robot
 from ngo_estimator.nodes.status import NodeStatus
@@ -30,6 +32,7 @@ if TYPE_CHECKING:  # torch takes seconds: a bad parameter is said at once
     from ngo_estimator.slam.fleet import FleetUpdate
     from ngo_estimator.slam.map_origin import MapOrigin
     from ngo_estimator.slam.trajectory_update import Trajectory
+    from ngo_estimator.trajectory.g2o import PlanarGraph
 
 _SERVICES = QoSProfile(depth=1000)
 _AT_ONCE = 8  # relative poses of a robot that are taken where the node fell behind
@@ -87,7 +90,12 @@ class RobotFleet:
             built.callback(self._status.close)
             self._robots = {name: _Robot(self, name, built) for name in settings.robots}
         self._status.idle = "inactive"
-        for kind, name, callback in ((Reset, "~/reset", self._on_reset), (SetBool, "~/pause", self._on_pause)):
+        FileServices(node, settings, self._trajectories, self._graph).open(_SERVICES, built)
+        for kind, name, callback in (
+            (Reset, "~/reset", self._on_reset),
+            (SetBool, "~/pause", self._on_pause),
+            (RemoveLoop, "~/remove_loop", self._on_remove_loop),
+        ):
             service = node.create_service(kind, name, callback, qos_profile=_SERVICES)
             built.callback(node.destroy_service, service)
 
@@ -136,6 +144,23 @@ class RobotFleet:
             return None
         self._use_map(robot, self._fleet.map_of(name))
         return replace(whole, poses_xyyaw=self._origin_of(robot).poses(whole.poses_xyyaw))
+
+    def _trajectories(self) -> "dict[str, Trajectory]":
+        """The trajectories of the robots that have begun."""
+        found = {name: self.trajectory(name) for name in self._robots}
+        return {name: trajectory for name, trajectory in found.items() if trajectory is not None}
+
+    def _graph(self) -> "PlanarGraph | None":
+        """The graph of all robots, with its poses in the map of all."""
+        graph = self._fleet.planar_graph()
+        return graph and replace(graph, poses=self._origin.poses(graph.poses))
+
+    def _on_remove_loop(self, request: RemoveLoop.Request, response: RemoveLoop.Response) -> RemoveLoop.Response:
+        if remove_loops(self._fleet.core, request, response, self.node.get_logger()):
+            self._on_correction()
+            if self._inputs:
+                self._pending.reset()
+        return response
 
     def _origin_of(self, robot: _Robot) -> "MapOrigin":
         """Where the robot's map lies in its frame: that of all may begin elsewhere."""

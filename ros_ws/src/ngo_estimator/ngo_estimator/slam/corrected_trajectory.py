@@ -241,8 +241,14 @@ class CorrectedTrajectory(ABC):
 
         Args:
             first, second: the frames; with ``stretch`` the first and the last one of the stretch.
+
+        Raises:
+            ValueError: a stretch is to end in the drive of another robot.
         """
         low, high = min(first, second), max(first, second)
+        ranks = self._back_end.graph.rank_of_frames
+        if stretch and ranks[low] != ranks[high]:
+            raise ValueError("the stretch begins in one robot's drive and ends in another's; expected a single one")
 
         def which(frames: np.ndarray) -> np.ndarray:
             within = ((frames >= low) & (frames <= high)).any(axis=1)
@@ -254,6 +260,11 @@ class CorrectedTrajectory(ABC):
         self._optimized |= removed > 0 and not self._back_end.fault
         self._fault = self._back_end.fault or self._fault
         return removed
+
+    @property
+    def vertices(self) -> np.ndarray:
+        """The frames ``(n,)`` that are the vertices of ``planar_graph``."""
+        return np.arange(self._log.steps + 1)
 
     def planar_graph(self) -> PlanarGraph | None:
         """The graph as it is now, with the belief in its loops, or None before the first step."""

@@ -16,6 +16,7 @@ from ngo_estimator.geometry.planar_motion import between, compose, propagated, t
 from ngo_estimator.geometry.se2 import between as between_all
 from ngo_estimator.slam.scan_trajectory import ScanTrajectory
 from ngo_estimator.slam.trajectory_update import Trajectory, TrajectoryUpdate
+from ngo_estimator.trajectory.g2o import PlanarGraph
 
 _MOST_WAITING = 100
 """Steps without a key scan that wait until their robot's next key scan, at most."""
@@ -213,6 +214,17 @@ class Fleet:
         points = self.core.walls(most)
         at = np.column_stack((points, np.zeros(len(points))))
         return np.asarray(between_all(self._begin_pose(robot), at)[:, :2])
+
+    def planar_graph(self) -> PlanarGraph | None:
+        """The graph of all robots, in the map of all; None before the first step.
+
+        A robot that is not in that map lies anywhere: the step to it says next to nothing.
+        """
+        graph, nodes = self.core.planar_graph(), self.core.back_end.graph
+        begin = nodes.streams[nodes.ranks == self._common]
+        if graph is None or len(begin) == 0:
+            return graph
+        return replace(graph, poses=between_all(graph.poses[begin[0]], graph.poses))
 
     def trajectory(self, robot: str) -> Trajectory | None:
         """The frames of a robot that are in the map in which it is now, in that map; None before its first step.

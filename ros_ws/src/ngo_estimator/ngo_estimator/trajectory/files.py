@@ -72,6 +72,11 @@ def write_trajectory(path: Path, stamps_ns: np.ndarray, poses_xyyaw: np.ndarray)
         ValueError: another ending, no pose to write, or something at its place that is no regular file.
         OSError: a file cannot be written; those that were there before still are.
     """
+    return write_lines(trajectory_lines(path, stamps_ns, poses_xyyaw))
+
+
+def trajectory_lines(path: Path, stamps_ns: np.ndarray, poses_xyyaw: np.ndarray) -> dict[Path, Iterator[str]]:
+    """The lines of each file that ``write_trajectory`` writes; raises ``ValueError`` as that does."""
     if path.suffix not in ENDINGS:
         raise ValueError(f"file is '{path}'; allowed: a name that ends in {', '.join(ENDINGS[:-1])} or {ENDINGS[-1]}")
     if len(stamps_ns) == 0:
@@ -80,8 +85,8 @@ def write_trajectory(path: Path, stamps_ns: np.ndarray, poses_xyyaw: np.ndarray)
         raise ValueError(f"stamps are {len(stamps_ns)} and poses {len(poses_xyyaw)}; expected as many")
     if path.suffix == _KITTI:
         times = (seconds(stamp) for stamp in stamps_ns.tolist())
-        return write_lines({path.with_suffix(_TIMES): times, path: _kitti_lines(poses_xyyaw)})
-    return write_lines({path: tum_lines(stamps_ns, poses_xyyaw)})
+        return {path.with_suffix(_TIMES): times, path: _kitti_lines(poses_xyyaw)}
+    return {path: tum_lines(stamps_ns, poses_xyyaw)}
 
 
 def seconds(stamp_ns: int) -> str:
