@@ -18,7 +18,6 @@ _TITLES = {
     "icp_slam": "MRPT `icp-slam`",
     "rbpf_slam": "MRPT `rbpf-slam`",
     "without_agreement": "ours, loops need no neighbours that agree",
-    "without_kernel": "ours, without the robust kernel",
     "cartographer_published": "Cartographer, as published (Hess et al. 2016), not run here",
 }
 
@@ -184,7 +183,6 @@ def _title(row: str) -> str:
 
 _SOLVERS = {
     "ours": "**ours**",
-    "without_kernel": "ours, without the robust kernel",
     "gtsam_lm": "GTSAM, LM with Cauchy",
     "gtsam_gnc": "GTSAM, GNC",
 }

@@ -32,7 +32,6 @@ from training.scoring import wrong_loops
 from training.scoring.wrong_loops import Solver, WrongLoopsConfig, solve_ours, with_wrong_loops
 
 _MOST_WALL_POINTS = 60_000  # of a picture
-_NO_KERNEL = 1e6  # deviations: so wide that every residual counts in full
 _PIPELINE = (mixture_lidar, scan_trajectory)
 
 
@@ -252,8 +251,8 @@ def _gtsam(solve: Solver) -> Row:
     return Row(partial(graph_peer, solve=solve, config=config), config, code=(*_PIPELINE, lidar_peers))
 
 
-def _fed(solve: Solver, percent: float, **changes: Any) -> Row:
-    config, wrong = GraphPeerConfig(**changes), WrongLoopsConfig(percent)
+def _fed(solve: Solver, percent: float) -> Row:
+    config, wrong = GraphPeerConfig(), WrongLoopsConfig(percent)
     return Row(
         partial(fed_with_wrong_loops, solve=solve, config=config, wrong=wrong),
         {"solver": dataclasses.asdict(config), "wrong": dataclasses.asdict(wrong)},
@@ -274,15 +273,13 @@ ROWS: dict[str, Row] = {
     "gtsam_gnc": _gtsam(lidar_peers.solve_gnc),
     "kiss_icp": Row(partial(kiss, config=KissConfig()), KissConfig(), code=(lidar_peers,), missing=_kiss_missing),
     "without_agreement": _ours(True, graph={"loops.least_agreeing": 0, "loops.agreeing_per_deviation": 0.0}),
-    "without_kernel": _ours(True, graph={"kernel": _NO_KERNEL}),
     **{
-        f"{name}_{percent}_percent_wrong": _fed(solve, percent, **changes)
+        f"{name}_{percent}_percent_wrong": _fed(solve, percent)
         for percent in (10, 30, 60)
-        for name, solve, changes in (
-            ("ours", solve_ours, {}),
-            ("without_kernel", solve_ours, {"cauchy": _NO_KERNEL}),
-            ("gtsam_lm", lidar_peers.solve_lm, {}),
-            ("gtsam_gnc", lidar_peers.solve_gnc, {}),
+        for name, solve in (
+            ("ours", solve_ours),
+            ("gtsam_lm", lidar_peers.solve_lm),
+            ("gtsam_gnc", lidar_peers.solve_gnc),
         )
     },
 }
