@@ -19,7 +19,6 @@ from typing import Any, Literal
 import numpy as np
 
 from ngo_estimator.graph.corrector import CorrectedGraph, Corrector, GraphProblem, truncated_cost
-from ngo_estimator.graph.crowds import CrowdAware
 from ngo_estimator.graph.robust import Robust
 from training.baselines import graph_peers
 from training.common import records
@@ -41,7 +40,7 @@ PEERS: dict[str, graph_peers.Peer] = {
     "gtsam_lm_geman_mcclure": graph_peers.geman_mcclure,
     "pcm": graph_peers.pcm,
 }
-_OURS: dict[str, Callable[[], Corrector]] = {"robust": Robust, "robust_anew": Robust, "crowd_aware": CrowdAware}
+_OURS: dict[str, Callable[[], Corrector]] = {"robust": Robust, "robust_anew": Robust}
 ROWS = ("odometry", *PEERS, *_OURS, "right_loops")
 SOLVED = 1.5
 """A graph is solved where its error is below so many times that of the right loops."""
@@ -70,7 +69,7 @@ class Arguments:
     """Seeds of a cell's graphs."""
     rows: tuple[str, ...] = tuple(row for row in ROWS if row != "robust_anew")
     """Rows to measure; odometry and right_loops are always measured. robust_anew solves each block from nothing."""
-    limit_s: int = 300
+    limit_s: int = 30
     """Computing time after which a peer is stopped; its answer is the odometry then, which counts as not solved."""
     out: Path = records.ROOT / "training" / "results"
     """Folder that gets graphs.json."""

@@ -89,15 +89,6 @@ class Robust:
         return replace(warm, loops_from_nothing=loops) if better else anew
 
 
-def finished(
-    problem: GraphProblem, poses: np.ndarray, scale: float = 1.0, told: Told = silent, least_scale: float = LEAST_SCALE
-) -> CorrectedGraph:
-    """The solution that poses ``(nodes, 3)`` from elsewhere lead to, with variances ``scale`` times as stated."""
-    scaled = problem.scaled(scale)
-    poses = _looked_again(scaled, poses, map_area(poses), 0.5, told)
-    return _polished(problem, poses, scale, len(problem.loops), least_scale)
-
-
 def with_copies_once(problem: GraphProblem) -> GraphProblem:
     """The problem in which copies of a loop share its trust: written again, it is no second witness."""
     loops = problem.loops

@@ -13,7 +13,7 @@ import json
 import time
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any
 
 import numpy as np
 import tyro
@@ -21,7 +21,6 @@ from rich.console import Console
 
 from ngo_common.files import write_together
 from ngo_estimator.graph.corrector import CorrectedGraph
-from ngo_estimator.graph.crowds import CrowdAware
 from ngo_estimator.graph.relative_poses import BELIEVED
 from ngo_estimator.graph.robust import Robust
 from ngo_estimator.nodes.command import run_command
@@ -39,8 +38,6 @@ class Arguments:
     """g2o file of a planar pose graph; it may be packed (.g2o.gz)."""
     out: Path
     """g2o file to write; a picture and a list of all loops lie beside it."""
-    corrector: Literal["robust", "crowd_aware"] = "robust"
-    """crowd_aware: one in which many loops at one place count as a few is tried, too; it takes 2 to 3 times as long."""
     picture: bool = True
     """Whether to draw the picture."""
     overwrite: bool = False
@@ -81,8 +78,7 @@ def run(arguments: Arguments, console: Console) -> dict[str, Any]:
     screen = Console(stderr=True)
     with screen.status("") as status:
         try:
-            chosen = CrowdAware if arguments.corrector == "crowd_aware" else Robust
-            solution = chosen(lambda words: status.update(f"{words}, {time.monotonic() - began:.0f} s")).correct(
+            solution = Robust(lambda words: status.update(f"{words}, {time.monotonic() - began:.0f} s")).correct(
                 graph.problem
             )
         except (ArithmeticError, MemoryError) as error:
