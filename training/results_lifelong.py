@@ -2,15 +2,16 @@
 
     python -m training.results --world lifelong
     python -m training.results --world lifelong --tables fleet join --buildings 3 --aliased 3 --scans 1500
+    python -m training.results --world lifelong --tables fleet --robots 4 --buildings 3 --aliased 2
     python -m training.results --world lifelong --tables year --years 1 --drives 20 --year-scans 1000
 
 What is measured is kept in ``runs/``, of a year each drive, so that the command goes on after a stop. It writes
 ``training/results/lifelong.json`` and ``docs/results_lifelong.md`` with its pictures. A table that is not measured
-stays as the JSON has it.
+stays as the JSON has it; more robots than two have tables of their own.
 """
 
 import json
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any, Literal
 
@@ -31,10 +32,11 @@ from training.scoring import fleet_rows, year_rows
 from training.scoring.fleet_rows import FleetRuns
 from training.scoring.statistics import mean_interval
 from training.scoring.table import Drive, Numbers, Row, Table, column, folder_digest, intervals, measure, pairs, samples
-from training.scoring.year_rows import Year, patrol, year_numbers, year_ratios
+from training.scoring.year_rows import Year, patrol, year_least, year_numbers, year_ratios
 
 _YEAR_CODE = (session, scan_map, scan_trajectory, mixture_lidar, year_rows)
 _YEAR_FIRST = 200
+_NO_END = 10**9  # key scans, which no year has
 _CODE = (fleet, session_union, scan_trajectory, mixture_lidar, fleet_rows)
 _SEEDS = {"validation": range(12_000, 13_000), "test": BUILDING_TEST_SEEDS[600:]}
 _ROWS = {"fleet": ("alone", "together"), "join": ("alone", "joined")}
@@ -62,6 +64,8 @@ class Arguments(Folders):
     """Buildings that a robot patrols for a year."""
     drives: int = 200
     """Drives of a year."""
+    year_rows: tuple[Literal["learn", "keep_all"], ...] = ("learn",)
+    """Rows of a year; keep_all: no key scan ever leaves the graph."""
     year_scans: int = 2000
     """Scans of each drive."""
     starts: int = 4
@@ -81,29 +85,30 @@ def main(arguments: Arguments) -> dict[str, Any]:
     """Measure, write everything, and return the JSON's content."""
     record, path = records.record("results", arguments), arguments.out / "lifelong.json"
     result: dict[str, Any] = json.loads(path.read_text()) if path.exists() else {"tables": {}}
-    made: dict[str, dict[str, Table]] = {"fleet": {}, "join": {}, "year": {}}
     for name in arguments.tables:
-        made[name] = {kind: _measured(name, kind, arguments) for kind in _KINDS[name]}
-        how = {"command": _command(arguments, name), "revision": record["revision"]}
         settings = {setting: getattr(arguments, setting) for setting in ("split", *_SETTINGS[name])}
+        how = {"command": _command(arguments, name), "revision": record["revision"], "settings": settings}
         if name == "year":
-            result |= {
-                "year": {**how, "settings": settings, "ratios": year_ratios(column(made[name]["year"], "learn"))}
-            }
-            result["tables"]["year"] = year_numbers(column(made[name]["year"], "learn"))
+            table = _years(arguments)
+            for row in arguments.year_rows:
+                years, key = column(table, row), "year" if row == "learn" else f"year_{row}"
+                result[key] = {**how, "ratios": year_ratios(years), "least": year_least(years)}
+                result["tables"][key] = year_numbers(years)
+            lifelong_page.draw_year(arguments.images, table)
         else:
-            about = {**how, "settings": settings, "paired": _paired(made[name], name)}
-            result |= about if name == "fleet" else {name: about}
-            result["tables"][name] = _robots(made[name], name)
-    lifelong_page.draw(arguments.images, made["fleet"], made["year"].get("year", {}))
+            found = {kind: _fleets(kind, name, arguments) for kind in _PREFIX}
+            key = name if arguments.robots == 2 else f"{name}_{arguments.robots}"
+            result[key] = {**how, "paired": _paired(found, name)}
+            result["tables"][key] = _robots(found, name)
+            if name == "fleet":
+                lifelong_page.draw_fleets(arguments.images, key, found)
     return arguments.publish("lifelong", result, lifelong_page.page(result, arguments.images))
 
 
-_KINDS = {"fleet": ("buildings", "aliased"), "join": ("buildings", "aliased"), "year": ("year",)}
 _SETTINGS = {
     "fleet": ("buildings", "aliased", "robots", "scans"),
     "join": ("buildings", "aliased", "robots", "scans"),
-    "year": ("years", "drives", "year_scans", "starts", "most_scans"),
+    "year": ("years", "drives", "year_rows", "year_scans", "starts", "most_scans"),
 }
 
 
@@ -126,20 +131,22 @@ def _paired(found: dict[str, Table], name: str) -> dict[str, Any]:
 
 
 def _command(arguments: Arguments, table: str) -> str:
-    chosen = " ".join(f"--{name.replace('_', '-')} {getattr(arguments, name)}" for name in _SETTINGS[table])
+    given = {name: getattr(arguments, name) for name in _SETTINGS[table]}
+    words = {name: " ".join(value) if isinstance(value, tuple) else value for name, value in given.items()}
+    chosen = " ".join(f"--{name.replace('_', '-')} {value}" for name, value in words.items())
     if arguments.split != "test":
         chosen += f" --split {arguments.split}"
     return f'make results WORLD=lifelong ARGS="--tables {table} {chosen}"'
 
 
-def _measured(name: str, kind: str, arguments: Arguments) -> Table:
-    return _years(arguments) if kind == "year" else _fleets(name, kind, arguments)
-
-
 def _years(arguments: Arguments) -> Table:
     weights, folder = arguments.weights / "scan", arguments.runs / "lifelong"
     identity = f"{folder_digest(weights)} {code_digest((*_YEAR_CODE, year_drives))}"
-    row = Row(partial(patrol, identity=identity), folder_digest(weights), _YEAR_CODE)
+    measures = {"learn": patrol, "keep_all": lambda year, identity: patrol(replace(year, most_scans=_NO_END), identity)}
+    rows: dict[str, Row] = {
+        row: Row(partial(measures[row], identity=identity), folder_digest(weights), _YEAR_CODE)
+        for row in arguments.year_rows
+    }
     of_each = arguments.drives, arguments.year_scans, arguments.starts, arguments.most_scans
     plan = [
         (
@@ -149,14 +156,14 @@ def _years(arguments: Arguments) -> Table:
                 partial(Year, seed, *of_each, weights, folder / f"year_{seed}"),
                 (year_drives,),
             ),
-            {"learn": row},
+            rows,
         )
         for seed in _SEEDS[arguments.split][_YEAR_FIRST:][: arguments.years]
     ]
     return measure(plan, folder, "year")
 
 
-def _fleets(name: str, kind: str, arguments: Arguments) -> Table:
+def _fleets(kind: str, name: str, arguments: Arguments) -> Table:
     aliased = kind == "aliased"
     seeds = _SEEDS[arguments.split]
     seeds = seeds[_ALIASED_FIRST:][: arguments.aliased] if aliased else seeds[: arguments.buildings]

@@ -56,7 +56,8 @@ another odometry: the state that was saved is loaded, the robot is looked for in
 with `map_changes:=learn`. From {settings[most_scans]} key scans on, old ones leave the graph.
 
 - Error: root mean square distance of the drive's positions, from where the robot was found on. The whole map is laid
-  on the truth by one rigid motion. A drive in which the robot was never found has none. Intervals are over drives.
+  on the truth by one rigid motion. A drive in which the robot was never found has none: means and intervals are over
+  the others.
 - IoU: of the cells of `/map` with those that exact rays from the true poses of its scans see in the building as it is
   at the end of the drive, with each door as it was at the scan. Cells have 5 cm: of the thin lines of occupied ones
   noise alone makes many differ. Where all scans count alike, older ones are not bounded.
@@ -65,19 +66,18 @@ with `map_changes:=learn`. From {settings[most_scans]} key scans on, old ones le
 - Time a scan: computing time of odometry and correction; that of the map, drawn every 5 s, comes on top. Memory: all
   arrays of the saved state and of the map's scans."""
 
+_KEEP_ALL = "The same where no key scan ever leaves the graph, made by `{command}`:"
+
 _YEAR_RATIOS = {
     "memory_mb": "memory over that of drives 11 to 20",
     "ms_a_scan": "time a scan over that of drives 11 to 20",
     "ate_m": "error over that of the first ten",
 }
 
-_INTRODUCTION = """## Several robots on one map
+_FLEETS = """## Several robots on one map
 
-Made by `{command}`.
-
-{settings[robots]} robots drive through each building at the same time, with {settings[scans]} scans of 360 rays each,
-ten a second. There are {settings[buildings]} buildings as drawn, and {settings[aliased]} whose rooms look alike
-(`aliased`), of the {settings[split]} split. These are few, so intervals of 95 %, by resampling buildings, are wide.
+Robots drive through each building at the same time, with scans of 360 rays, ten a second. In `aliased` buildings rooms
+look alike. Buildings are few, so intervals of 95 %, by resampling buildings, are wide.
 
 - `alone`: each robot has an `ngo_node` of its own. `together`: one for all, as with `robots` of `ngo_node`.
 - Error: the root mean square distance of positions, each robot's trajectory aligned by itself, in the mean over robots;
@@ -86,23 +86,25 @@ ten a second. There are {settings[buildings]} buildings as drawn, and {settings[
   on, where they met.
 - False meetings: buildings in which a robot ever was more than 2 m from where the common map had it."""
 
-_JOIN = """## Saved maps joined
+_JOINS = """## Saved maps joined
 
-Made by `{command}`.
+Robots drive as above, each maps alone, and `join_sessions` lays their saved states into one map afterwards (`joined`).
+Met: the share of the other maps that were laid into the first one. False meetings: the map has a robot more than 2 m
+from where it was (root mean square)."""
 
-{settings[robots]} robots drive as above, each maps alone, and `join_sessions` lays their saved states into one map
-afterwards (`joined`). There are {settings[buildings]} buildings as drawn, and {settings[aliased]} whose rooms look
-alike, of the {settings[split]} split. Met: the share of the other maps that were laid into the first one. False
-meetings: the map has a robot more than 2 m from where it was (root mean square)."""
+_ROBOTS = """### {settings[robots]} robots
 
-_RATIO = "Error together over error alone, in the mean over buildings: {together}, and {aliased} in aliased ones."
+Made by `{command}`: {settings[buildings]} buildings as drawn and {settings[aliased]} aliased ones of the
+{settings[split]} split, {settings[scans]} scans of each robot."""
+
+_RATIO = "Error together over error alone, in the mean over buildings: {drawn}, and {aliased} in aliased ones."
 
 
 _MOST_PANELS, _RESOLUTION_M = 4, ScanMapConfig().resolution_m
 
 
-def draw(folder: Path, fleets: Mapping[str, Table], year: Table) -> None:
-    """Draw what was measured: the first maps of robots that have met, and a year in the first building."""
+def draw_fleets(folder: Path, key: str, fleets: Mapping[str, Table]) -> None:
+    """Draw the first maps of robots that have met, of the table ``key``."""
     all_met = [
         (name, rows["together"])
         for found in fleets.values()
@@ -110,15 +112,20 @@ def draw(folder: Path, fleets: Mapping[str, Table], year: Table) -> None:
         if rows["together"].errors["met"].min() == 1.0 and "walls" in rows["together"].drawn
     ][:_MOST_PANELS]
     if all_met:
-        _draw_fleets(folder / _FLEET, all_met)
-    for rows in list(year.values())[:1]:
-        _draw_year(folder / _YEAR_MAPS, rows["learn"])
-        _draw_numbers(folder / _YEAR_NUMBERS, year)
+        _draw_fleets(folder / _FLEET.format(key), all_met)
 
 
-_FLEET, _YEAR_MAPS, _YEAR_NUMBERS = (f"results_lifelong_{name}.png" for name in ("fleet", "year", "year_numbers"))
+def draw_year(folder: Path, year: Table) -> None:
+    """Draw a year in the first building, and the numbers of all, where old key scans leave."""
+    learned = {name: rows["learn"] for name, rows in year.items() if "learn" in rows}
+    for measured in list(learned.values())[:1]:
+        _draw_year(folder / _YEAR_MAPS, measured)
+        _draw_numbers(folder / _YEAR_NUMBERS, learned)
+
+
+_FLEET, _YEAR_MAPS, _YEAR_NUMBERS = (f"results_lifelong_{name}.png" for name in ("{}", "year", "year_numbers"))
+_FLEET_CAPTION = "Maps of {} robots that have met: key scans (grey), and the way of each robot."
 _CAPTIONS = {
-    _FLEET: "Maps of robots that have met: key scans (grey), and the way of each robot.",
     _YEAR_MAPS: "The map after the first, the middle and the last drive (above), and the building as it was then.",
     _YEAR_NUMBERS: "Error, map, memory and time of each drive of the year; a line for each building.",
 }
@@ -158,12 +165,12 @@ def _draw_year(path: Path, measured: Measured) -> None:
     save(figure, path, dpi=80)
 
 
-def _draw_numbers(path: Path, year: Table) -> None:
+def _draw_numbers(path: Path, year: Mapping[str, Measured]) -> None:
     shown = [column for column in _YEAR_COLUMNS if column.key in ("ate_m", "iou", "memory_mb", "ms_a_scan")]
     figure, axes = panels(len(shown), 2, 6.0, 3.0)
     for axis, column in zip(axes, shown, strict=True):
-        for name, rows in year.items():
-            axis.plot(rows["learn"].errors[column.key], linewidth=0.9, label=name)
+        for name, measured in year.items():
+            axis.plot(measured.errors[column.key], linewidth=0.9, label=name)
         axis.set_ylim(bottom=0.0)
         axis.set_title(column.title)
         axis.set_xlabel("drive")
@@ -172,25 +179,32 @@ def _draw_numbers(path: Path, year: Table) -> None:
 
 def page(result: dict[str, Any], images: Path) -> str:
     """The page of a JSON's content, with the figures that are in the folder ``images``."""
-    parts = ["# Results: maps that last"]
-    tables = result["tables"]
-    if "fleet" in tables:
-        paired = result["paired"]
-        ratios = {name: interval(paired[f"{kind}together"]["ate_ratio"]) for name, kind in _RATIOS.items()}
-        rows = {f"`{row}`": numbers for row, numbers in tables["fleet"].items()}
-        parts += [_INTRODUCTION.format(**result), table(rows, _COLUMNS, "Row"), _RATIO.format(**ratios)]
-    if "join" in tables:
-        join = result["join"]
-        ratios = {name: interval(join["paired"][f"{kind}joined"]["ate_ratio"]) for name, kind in _RATIOS.items()}
-        rows = {f"`{row}`": numbers for row, numbers in tables["join"].items()}
-        parts += [_JOIN.format(**join), table(rows, _JOIN_COLUMNS, "Row"), _RATIO.format(**ratios)]
-    if "year" in tables:
-        year = result["year"]
-        rows = {row.replace("_", " "): numbers for row, numbers in tables["year"].items()}
-        said = [(name, interval(year["ratios"][key])) for key, name in _YEAR_RATIOS.items()]
-        parts += [_YEAR.format(**year), table(rows, _YEAR_COLUMNS, "Drives")]
+    parts, tables, captions = ["# Results: maps that last"], result["tables"], {}
+    for name, words, row, columns in (
+        ("fleet", _FLEETS, "together", _COLUMNS), ("join", _JOINS, "joined", _JOIN_COLUMNS)
+    ):  # fmt: skip
+        keys = _tables(tables, name)
+        parts += [words] if keys else []
+        for key in keys:
+            ratios = {of: interval(result[key]["paired"][f"{kind}{row}"]["ate_ratio"]) for of, kind in _KINDS.items()}
+            rows = {f"`{title}`": numbers for title, numbers in tables[key].items()}
+            parts += [_ROBOTS.format(**result[key]), table(rows, columns, "Row"), _RATIO.format(**ratios)]
+            captions[_FLEET.format(key)] = _FLEET_CAPTION.format(result[key]["settings"]["robots"])
+    for key in _tables(tables, "year"):
+        year = result[key]
+        rows = {row.replace("_", " "): numbers for row, numbers in tables[key].items()}
+        said = [(name, interval(year["ratios"][ratio])) for ratio, name in _YEAR_RATIOS.items()]
+        parts += [(_YEAR if key == "year" else _KEEP_ALL).format(**year), table(rows, _YEAR_COLUMNS, "Drives")]
         parts += ["The last ten drives: " + ", ".join(f"{name} {value}" for name, value in said if value) + "."]
-    return whole([*parts, *figures({name: text for name, text in _CAPTIONS.items() if (images / name).exists()})])
+        parts += [_LEAST.format(number(year["least"]["iou"]))] if "least" in year else []
+    captions |= _CAPTIONS
+    return whole([*parts, *figures({name: text for name, text in captions.items() if (images / name).exists()})])
 
 
-_RATIOS = {"together": "", "aliased": "aliased_"}
+def _tables(tables: Mapping[str, Any], name: str) -> list[str]:
+    """The keys of the tables of a kind: ``name`` itself, and those with more robots or of another row."""
+    return sorted(key for key in tables if key.split("_")[0] == name)
+
+
+_LEAST = "The least IoU of free cells after any drive is {}."
+_KINDS = {"drawn": "", "aliased": "aliased_"}

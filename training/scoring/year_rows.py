@@ -114,6 +114,11 @@ def year_ratios(years: Sequence[Measured]) -> Numbers:
     return intervals(found)
 
 
+def year_least(years: Sequence[Measured]) -> dict[str, float]:
+    """The least IoU of free cells after any drive of any year."""
+    return {"iou": float(_of(years, "iou", slice(None)).min())}
+
+
 def _of(years: Sequence[Measured], key: str, which: slice) -> np.ndarray:
     """A number of some drives of all years, of those that have it ``(n,)``."""
     values = np.concatenate([year.errors[key][which] for year in years])

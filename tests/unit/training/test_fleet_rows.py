@@ -1,5 +1,6 @@
 """When robots should have met, and whether they are where the common map has them, against answers by hand."""
 
+import dataclasses
 from typing import Any
 
 import numpy as np
@@ -67,9 +68,13 @@ def test_the_table_has_a_row_for_each_way_and_kind(
     folders = {name: tmp_path / name for name in ("out", "docs", "runs")}
     chosen = results_lifelong.Arguments(split="validation", tables=(name,), buildings=2, aliased=2, **folders)
     result = results_lifelong.main(chosen)
-    how = result if name == "fleet" else result[name]
+    how = result[name]
     assert how["command"].endswith(' --split validation"')
     assert list(result["tables"][name]) == ["alone", row, "aliased_alone", f"aliased_{row}"]
     assert result["tables"][name]["aliased_alone"]["ate_m"]["mean"] == pytest.approx(1.1)
     assert how["paired"][row]["ate_ratio"]["mean"] == pytest.approx(0.5)
-    assert f"| `{row}` | 0.0500 " in (tmp_path / "docs" / "results_lifelong.md").read_text()
+    more = results_lifelong.main(dataclasses.replace(chosen, robots=4))
+    assert more["tables"][f"{name}_4"] == result["tables"][name] == more["tables"][name]
+    assert "--robots 4 " in more[f"{name}_4"]["command"] and more[name] == how
+    page = (tmp_path / "docs" / "results_lifelong.md").read_text()
+    assert page.count(f"| `{row}` | 0.0500 ") == 2 and "### 4 robots" in page

@@ -29,7 +29,7 @@ def a_year(drives: int) -> Measured:
     empty = {f"{when}_{kind}": np.zeros((2, 2), np.int8) for kind in ("found", "true") for when in _WHEN}
     corners = {f"{when}_corners": np.zeros((2, 2)) for when in _WHEN}
     errors = {"ate_m": np.where(number == 5.0, np.nan, number), "memory_mb": number + 1.0, "ms_a_scan": number + 1.0}
-    return Measured({**errors, "iou": 0.0 * number, "occupied_iou": 0.0 * number}, {**empty, **corners})
+    return Measured({**errors, "iou": 1.0 - 0.5 * (number == 7.0), "occupied_iou": 0.0 * number}, {**empty, **corners})
 
 
 _WHEN = ("first", "middle", "last")
@@ -42,14 +42,18 @@ def test_the_table_has_ten_drives_a_row_and_keeps_what_is_not_measured(
     folders: dict[str, Any] = {name: tmp_path / name for name in ("out", "docs", "runs")}
     folders["out"].mkdir()
     (folders["out"] / "lifelong.json").write_text('{"tables": {"other": {}}}')
-    chosen = results_lifelong.Arguments(split="validation", tables=("year",), years=2, drives=30, **folders)
+    chosen = results_lifelong.Arguments(
+        split="validation", tables=("year",), years=2, drives=30, year_rows=("learn", "keep_all"), **folders
+    )
     result = results_lifelong.main(chosen)
-    assert set(result["tables"]) == {"other", "year"}
+    assert set(result["tables"]) == {"other", "year", "year_keep_all"}
     assert list(result["tables"]["year"]) == ["first_ten", "eleven_to_twenty", "last_ten"]
     means = [row["ate_m"]["mean"] for row in result["tables"]["year"].values()]
     assert means == pytest.approx([40.0 / 9.0, 14.5, 24.5])
     assert result["year"]["ratios"]["memory_mb"]["mean"] == pytest.approx(25.5 / 15.5)
-    assert "| last ten | 24.5 " in (tmp_path / "docs" / "results_lifelong.md").read_text()
+    assert result["year"]["least"] == {"iou": 0.5}
+    page = (tmp_path / "docs" / "results_lifelong.md").read_text()
+    assert page.count("| last ten | 24.5 ") == 2 and "after any drive is 0.500." in page
 
 
 def test_a_year_goes_on_from_what_is_on_disk(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
