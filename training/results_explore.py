@@ -36,7 +36,7 @@ from training.report import explore_page
 from training.report.explore_figures import draw_figures
 from training.report.folders import Folders
 from training.scoring import exploring, known_tour, own_poses
-from training.scoring.exploring import Estimator, Explored, Seen, TruePosesMap, drive_known_tour, explore
+from training.scoring.exploring import ENOUGH, Estimator, Explored, Seen, TruePosesMap, drive_known_tour, explore
 from training.scoring.map_errors import intersections
 from training.scoring.own_poses import OwnPoses
 from training.scoring.statistics import mean_interval
@@ -228,8 +228,8 @@ def scores(run: Explored, seen: Seen) -> dict[str, float]:
         "collisions": 1e3 * run.collisions / max(float(run.path_m[-1]), 1.0),
         "decision_ms": float(np.percentile(run.decisions_ms, 99)) if len(run.decisions_ms) else 0.0,
     }
-    if np.isfinite(run.path_to(0.95)):
-        found["path_to_95_m"] = run.path_to(0.95)
+    if np.isfinite(run.path_to(ENOUGH)):
+        found["path_to_95_m"] = run.path_to(ENOUGH)
     return found
 
 

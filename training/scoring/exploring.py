@@ -23,6 +23,7 @@ from training.data.lidar_drives import TruePoses
 from training.scoring.known_tour import known_tour
 
 RESOLUTION_M = 0.05
+ENOUGH = 0.95  # of what can be seen: up to there paths are compared
 _MAP_EVERY_S = 0.5
 _MOVED_M, _TURNED_RAD = 0.1, math.radians(5.0)  # between two scans that enter the map
 _OCCUPANCY = OccupancyConfig()
@@ -35,7 +36,7 @@ class Explored:
     ``path_m``, ``coverage`` and ``time_s`` ``(n,)``: length of the path, share seen of what can be seen, and time.
     ``poses_xyyaw`` ``(m, 3)`` true. ``ended`` says whether the robot ended it by itself. ``found`` is its own map,
     aligned with the truth as a whole, ``at_true_poses`` that of the same scans at true poses, and ``errors`` are those
-    of its own poses, by the metric's key.
+    of its own poses, by the metric's key: ``ate_m`` when ``ENOUGH`` had been seen, ``ate_end_m`` at the end.
     """
 
     path_m: np.ndarray
@@ -191,6 +192,7 @@ class _Run:
         self._poses, self._decisions_ms = [self.sight.pose_xyyaw], list[float]()
         self._entered: np.ndarray | None = None
         self._mapped_s, self._path_m, self._collisions, self._touched, self._ended = -math.inf, 0.0, 0, False, False
+        self._enough: dict[str, float] | None = None
         self.found = _trinary(self._estimator.cells())
 
     @property
@@ -237,7 +239,12 @@ class _Run:
         self.found = _trinary(self._estimator.cells())
         seen = _trinary(self._grid.cells(_OCCUPANCY))
         self._rows.append((self._path_m, self._seen.coverage(seen), sight.time_s))
+        if self._enough is None and self._rows[-1][1] >= ENOUGH:
+            self._enough = self._estimator.errors(self._truth())
         return True
+
+    def _truth(self) -> TruePoses:
+        return TruePoses(np.array(self._stamps_ns), np.array(self._poses))
 
     def _hear(self) -> None:
         self._estimator.take(self.sight)
@@ -255,12 +262,14 @@ class _Run:
     def explored(self) -> Explored:
         """What came of it."""
         path, coverage, times = np.array(self._rows).T
-        poses, decisions = np.array(self._poses), np.array(self._decisions_ms)
-        truth = TruePoses(np.array(self._stamps_ns), poses)
+        truth, decisions = self._truth(), np.array(self._decisions_ms)
         errors, found = self._estimator.errors(truth), _trinary(self._estimator.aligned_cells(truth))
+        if "ate_m" in errors:
+            errors["ate_end_m"] = errors.pop("ate_m")
+            errors |= {key: value for key, value in (self._enough or {}).items() if key == "ate_m"}
         true = _trinary(self._grid.cells(_OCCUPANCY))
         counted = self._collisions, self._ended
-        return Explored(path, coverage, times, poses, decisions, *counted, found, true, errors)
+        return Explored(path, coverage, times, truth.poses_xyyaw, decisions, *counted, found, true, errors)
 
 
 def _trinary(found: OccupancyMap) -> OccupancyMap:
