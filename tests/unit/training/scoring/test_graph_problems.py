@@ -89,13 +89,17 @@ def test_our_corrector_finds_what_gtsam_finds_in_a_clean_graph(easy: JudgedProbl
 
 
 @pytest.mark.parametrize(
-    ("kind", "percent", "metric", "seed"), [("lookalike", 70, True, 0), ("random", 80, False, 105)]
+    ("kind", "percent", "nodes", "metric", "seed"),
+    [("lookalike", 70, 1000, True, 0), ("random", 80, 1000, False, 105), ("lookalike", 67, 3333, False, 107)],
 )
 def test_a_hard_graph_is_solved_though_its_chain_rules_out_loops_that_are_right(
-    kind: str, percent: int, metric: bool, seed: int
+    kind: str, percent: int, nodes: int, metric: bool, seed: int
 ) -> None:
-    """Most loops are wrong, and the odometry is 9 m off; of places, only the ways between them say which."""
-    judged = synthetic(kind, percent, 1000, metric, seed, hard=True)
+    """Most loops are wrong, and the odometry is 9 m off; of places, only the ways between them say which.
+
+    The largest graph has more loops than one factor holds.
+    """
+    judged = synthetic(kind, percent, nodes, metric, seed, hard=True)
     problem, kept = judged.problem, judged.problem.loops[judged.right]
     right = graph_peers.least_squares(GraphProblem(problem.poses, problem.steps, kept, np.ones(len(kept))))
     off = judged.ate_m(Robust().correct(problem).poses)

@@ -39,7 +39,10 @@ _GROWN = 1.25
 """A solution from nothing is worth its time once there are so many times as many loops as at the last one."""
 
 _MOST_FILLED = 2_000_000
-"""Blocks that one factorisation may multiply: where loops would fill it, the likeliest of them come first."""
+"""Blocks that one factorisation may multiply: where loops would fill it, some of them are tried."""
+
+_CELL = 40
+"""Nodes: loops whose ends are, both, within one cell of the chain say nearly the same."""
 
 _FEWER = 0.7
 """How many loops are tried where those before are too many."""
@@ -107,7 +110,7 @@ def _from_nothing(problem: GraphProblem, told: Told, least_scale: float) -> Corr
         scale = _noticed(scale, least_scale)
         scaled = problem.scaled(scale)
     odds = cycle_odds(ChainUncertainty(scaled.steps), scaled.loops, area, inlier_ratio)
-    begun, rows = replace(scaled, poses=chain), np.argsort(-odds, kind="stable")
+    begun, rows = replace(scaled, poses=chain), _spread(scaled.loops.nodes, odds)
     likely, structure = _affordable(begun, rows[: np.count_nonzero(odds > 0.0)])
     nothing = np.zeros(len(likely.loops), bool)
     solutions = [
@@ -148,6 +151,20 @@ def _warm(problem: GraphProblem, start: CorrectedGraph, told: Told, least_scale:
     part = replace(scaled, loops=scaled.loops[asked], trust=scaled.trust[asked])
     poses, _ = believe(part, poses, believed[asked], map_area(poses), told=told)
     return _polished(problem, poses, start.scale, start.loops_from_nothing, least_scale)
+
+
+def _spread(nodes: np.ndarray, odds: np.ndarray) -> np.ndarray:
+    """An order of loops ``(loops,)``: the likeliest of each cell, then the second ones, and those ruled out at the end.
+
+    The likeliest of all lie where the chain is short and leave most of a long one alone.
+    """
+    cells = np.unique(nodes // _CELL, axis=0, return_inverse=True)[1].ravel()
+    order = np.lexsort((-odds, cells))
+    first = np.searchsorted(cells[order], cells[order])
+    rank = np.empty(len(odds), np.int64)
+    rank[order] = np.arange(len(odds)) - first
+    spread: np.ndarray = np.lexsort((-odds, rank, odds <= 0.0))
+    return spread
 
 
 def _affordable(problem: GraphProblem, rows: np.ndarray) -> tuple[GraphProblem, GraphStructure]:
