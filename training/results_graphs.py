@@ -13,6 +13,7 @@ import json
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any, Literal
 
@@ -26,7 +27,7 @@ from training.common.command_line import run_command
 from training.common.records import write_at_once
 from training.report import graphs_page
 from training.scoring.graph_problems import KINDS, JudgedProblem, Online, blocks, lecture_hall, manhattan, synthetic
-from training.scoring.statistics import Interval, mean_interval
+from training.scoring.table import intervals
 
 GRAPHS = ("synthetic_1000", "synthetic_3000", "hard_1000", "hard_3000", "lecture_hall", "manhattan")
 _ONLINE = "_online"
@@ -98,7 +99,8 @@ def main(arguments: Arguments) -> dict[str, Any]:
         rows = result["tables"].setdefault(graph, {}).setdefault(cell, {})
         for row in measured[0]:
             made = {"graphs": len(measured), "revision": result["revision"]}
-            rows[row] = {**_intervals([each[row] for each in measured]), **made}
+            columns = {key: np.array([each[row][key] for each in measured]) for key in measured[0][row]}
+            rows[row] = {**intervals(columns), **made}
             if row in PEERS:
                 rows[row]["limit_s"] = arguments.limit_s
         print(f"{graph} {cell}: {json.dumps({row: _means(rows[row]) for row in measured[0]})}", flush=True)
@@ -119,22 +121,14 @@ def _cells(arguments: Arguments) -> Iterator[tuple[str, str, Callable[[int], Jud
                 name, place = kind.removesuffix("_place"), kind.endswith("_place")
                 if graph.startswith(("synthetic", "hard")):
                     form, nodes, *_ = graph.split("_")
-                    draw = _synthetic(name, percent, int(nodes), not place, form == "hard")
+                    draw = partial(synthetic, name, percent, int(nodes), not place, hard=form == "hard")
                     yield graph, f"{kind}_{percent}", draw
                 elif graph.startswith("manhattan") and folder is not None and not place:
-                    yield graph, f"{kind}_{percent}", _manhattan(folder, name, percent)
+                    yield graph, f"{kind}_{percent}", partial(manhattan, folder, name, percent)
 
 
 def _always(judged: JudgedProblem) -> Callable[[int], JudgedProblem]:
     return lambda _: judged
-
-
-def _synthetic(kind: str, percent: int, nodes: int, metric: bool, hard: bool) -> Callable[[int], JudgedProblem]:
-    return lambda seed: synthetic(kind, percent, nodes, metric, seed, hard)
-
-
-def _manhattan(folder: Path, kind: str, percent: int) -> Callable[[int], JudgedProblem]:
-    return lambda seed: manhattan(folder, kind, percent, seed)
 
 
 def _measure(
@@ -187,13 +181,6 @@ def _numbers(judged: JudgedProblem, poses: np.ndarray, seconds: float, bar: floa
         "recall": float(believed[judged.right].mean()),
         "seconds": seconds,
     }
-
-
-def _intervals(numbers: list[dict[str, float]]) -> dict[str, Any]:
-    def interval(values: np.ndarray) -> Interval:
-        return mean_interval(values) if len(values) > 1 else Interval(*(3 * (float(values[0]),)))
-
-    return {key: interval(np.array([each[key] for each in numbers])).as_json() for key in numbers[0]}
 
 
 def _means(row: dict[str, Any]) -> dict[str, float]:

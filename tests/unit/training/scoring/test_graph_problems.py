@@ -120,7 +120,9 @@ def test_a_peer_that_takes_too_long_or_fails_has_no_answer(easy: JudgedProblem) 
 
 def test_the_table_has_every_row_and_keeps_other_cells(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(
-        results_graphs, "synthetic", lambda kind, percent, _, *rest: synthetic(kind, percent, 200, *rest)
+        results_graphs,
+        "synthetic",
+        lambda kind, percent, _, *rest, hard=False: synthetic(kind, percent, 200, *rest, hard),
     )
     for kind in ("random", "local"):
         arguments = results_graphs.Arguments(
@@ -144,7 +146,7 @@ def test_a_peer_that_was_stopped_counts_as_not_solved_and_the_page_says_so(
             problem.poses.sum()
 
     easy = replace(easy, least_ate_m=1000.0)  # even the odometry is good enough
-    monkeypatch.setattr(results_graphs, "synthetic", lambda *_: easy)
+    monkeypatch.setattr(results_graphs, "synthetic", lambda *_, hard=False: easy)
     monkeypatch.setitem(results_graphs.PEERS, "pcm", never_ends)
     arguments = results_graphs.Arguments(
         graphs=("hard_1000",), kinds=("random",), percents=(50,), seeds=(0,), rows=("pcm",), limit_s=1,
@@ -168,7 +170,7 @@ def test_online_a_graph_comes_in_blocks_and_is_solved_in_each(tmp_path: Path, mo
     newest = [part.problem.loops.nodes.max(axis=1) for part in parts]
     assert all(len(part.problem.poses) == ends.max() + 1 for part, ends in zip(parts, newest, strict=True))
     assert newest[0].max() <= newest[1][120:].min()
-    monkeypatch.setattr(results_graphs, "synthetic", lambda *_: judged)
+    monkeypatch.setattr(results_graphs, "synthetic", lambda *_, hard=False: judged)
     arguments = results_graphs.Arguments(
         graphs=("hard_1000_online",), kinds=("random",), percents=(50,), seeds=(0,), rows=("robust", "robust_anew"),
         out=tmp_path, docs=tmp_path,
