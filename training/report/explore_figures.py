@@ -5,14 +5,10 @@ from __future__ import annotations
 from collections.abc import Mapping
 from pathlib import Path
 
-import matplotlib
-
-matplotlib.use("Agg")
-
-import matplotlib.pyplot as plt
 import numpy as np
 
 from ngo_explorer.known_map import Floats
+from training.report.pictures import panels, save
 from training.scoring.table import Measured, Table, column
 
 _SIDE_BY_SIDE = ("explore_lite", "ours", "known_tour")
@@ -21,7 +17,6 @@ _CELL_M = 0.05
 
 def draw_figures(folder: Path, tables: Mapping[str, Table]) -> dict[str, str]:
     """Draw the figures of all kinds of places; their captions by file name."""
-    folder.mkdir(parents=True, exist_ok=True)
     drawn = {}
     for kind, table in tables.items():
         name = f"results_explore_{kind}_coverage.png"
@@ -36,7 +31,7 @@ def draw_figures(folder: Path, tables: Mapping[str, Table]) -> dict[str, str]:
 
 
 def _draw_coverage(path: Path, table: Table) -> None:
-    figure, axes = plt.subplots(figsize=(7.0, 4.2))
+    figure, (axes,) = panels(1, 1, 7.0, 4.2)
     names = list(dict.fromkeys(row for rows in table.values() for row in rows))
     longest = max(found.drawn["path_m"][-1] for rows in table.values() for found in rows.values())
     along = np.linspace(0.0, longest, 400)
@@ -46,14 +41,12 @@ def _draw_coverage(path: Path, table: Table) -> None:
     axes.axhline(0.95, color="0.7", linewidth=0.8)
     axes.set(xlabel="path [m]", ylabel="share seen", ylim=(0.0, 1.02), xlim=(0.0, longest))
     axes.legend(fontsize=8, frameon=False)
-    figure.tight_layout()
-    figure.savefig(path, dpi=110)
-    plt.close(figure)
+    save(figure, path, dpi=110)
 
 
 def _draw_paths(path: Path, place: Mapping[str, Measured]) -> None:
-    figure, panels = plt.subplots(1, len(_SIDE_BY_SIDE), figsize=(15.0, 5.4), sharex=True, sharey=True)
-    for axes, name in zip(panels, _SIDE_BY_SIDE, strict=True):
+    figure, panel = panels(len(_SIDE_BY_SIDE), len(_SIDE_BY_SIDE), 5.0, 5.4)
+    for axes, name in zip(panel, _SIDE_BY_SIDE, strict=True):
         run = place[name]
         drawn = run.drawn
         free = np.unpackbits(drawn["free"], axis=1, count=int(drawn["columns"])).astype(bool)
@@ -70,6 +63,4 @@ def _draw_paths(path: Path, place: Mapping[str, Measured]) -> None:
             axes.plot(*way[min(int(np.searchsorted(walked, to)), len(way) - 1), :2], "x", color="red", markersize=9)
             title += f", {to:.0f} m to 95 %"
         axes.set_title(title, fontsize=10)
-    figure.tight_layout()
-    figure.savefig(path, dpi=100)
-    plt.close(figure)
+    save(figure, path, dpi=100)
