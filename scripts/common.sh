@@ -24,8 +24,12 @@ python_fits() { # is $1 a Python of a version that we serve?
     "$1" -c 'import sys; sys.exit(not (3, 10) <= sys.version_info[:2] <= (3, 13))' 2>/dev/null
 }
 
-# Prints the prefix of the installed ROS 2 Jazzy to use, or `wheels`. In this order: what make was told (ROS=), what this
-# shell has sourced, what .venv was made for, what is installed.
+is_wheels() { # is the ROS 2 $1 one of those from wheels?
+    [[ "$1" =~ ^(kilted-)?wheels$ ]]
+}
+
+# Prints the prefix of the installed ROS 2 Jazzy to use, or `wheels` or `kilted-wheels`. In this order: what make was told
+# (ROS=), what this shell has sourced, what .venv was made for, what is installed.
 find_underlay() {
     local prefix entries sourced=
     IFS=: read -ra entries <<<"${AMENT_PREFIX_PATH-}"
@@ -39,8 +43,8 @@ find_underlay() {
         die "ROS 2 '${ROS_DISTRO-}' is sourced in this shell, this project needs 'jazzy'; use a shell without it"
     elif [ -n "$sourced" ] && [ -n "${ROS-}" ] && [ "$ROS" != "$sourced" ]; then
         die "ROS=$ROS was asked for, but this shell has sourced $sourced; use a shell without it"
-    elif [ -n "${ROS-}" ] && [ "$ROS" != wheels ] && [ ! -f "$ROS/setup.bash" ]; then
-        die "ROS=$ROS was asked for, but there is no $ROS/setup.bash; give the prefix of an installed ROS 2 Jazzy, or 'wheels'"
+    elif [ -n "${ROS-}" ] && ! is_wheels "$ROS" && [ ! -f "$ROS/setup.bash" ]; then
+        die "ROS=$ROS was asked for, but there is no $ROS/setup.bash; give the prefix of an installed ROS 2 Jazzy, 'wheels' or 'kilted-wheels'"
     elif [ -n "${ROS-}" ]; then
         echo "$ROS"
     elif [ -n "$sourced" ]; then
@@ -73,7 +77,7 @@ find_python() {
         echo "$PYTHON"
         return
     fi
-    if [ "$1" != wheels ] && [ -x /usr/bin/python3 ]; then
+    if ! is_wheels "$1" && [ -x /usr/bin/python3 ]; then
         echo /usr/bin/python3
         return
     fi

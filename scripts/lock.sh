@@ -15,4 +15,5 @@ compile() { # OUTPUT REQUIREMENTS...
 }
 compile "$made/whole" --generate-hashes ros.txt runtime.txt test.txt
 compile "$made/lidar" ros.txt lidar.txt
-python3 "$ROOT/scripts/split_lock.py" "$made/whole" "$made/lidar" "$@"
+compile "$made/kilted" --generate-hashes ros_kilted.txt
+python3 "$ROOT/scripts/split_lock.py" "$made/whole" "$made/lidar" "$made/kilted" "$@"

@@ -35,7 +35,7 @@ else
     headers="$("$python" -c 'import sysconfig; print(sysconfig.get_paths()["include"])')"
     [ -f "$headers/Python.h" ] ||
         lack "the C headers of $python, which messages are compiled with (Debian, Ubuntu: apt-get install python3-dev)"
-    if [ "$underlay" != wheels ] && ! bash -c ". '$underlay/setup.bash' && '$python' -c 'import rclpy'" >/dev/null 2>&1; then
+    if ! is_wheels "$underlay" && ! bash -c ". '$underlay/setup.bash' && '$python' -c 'import rclpy'" >/dev/null 2>&1; then
         lack "a Python that the ROS 2 in $underlay works with: '$python' cannot import rclpy there (make PYTHON=..., or ROS=wheels)"
     fi
 fi

@@ -8,14 +8,19 @@ REQUIREMENTS = Path(__file__).parents[1] / "requirements"
 KINDS = {"locked_gpu": r"(nvidia[\w-]*|cuda[\w-]*|triton|torch)==", "locked_ros": r"ros-", "locked": r""}
 
 
-def main(whole: Path, lidar: Path, torch_hashes: list[str]) -> None:
-    """Write the five files; their comments stay. torch_hashes: of PyTorch's CPU builds, which are not on PyPI.
+def _entries(lock: Path) -> list[str]:
+    return re.split(r"(?m)^(?=[A-Za-z0-9])", lock.read_text())[1:]
 
-    ``lidar``: a lock of what the estimators of a lidar need, of which the names count.
+
+def main(whole: Path, lidar: Path, kilted: Path, torch_hashes: list[str]) -> None:
+    """Write the six files; their comments stay. torch_hashes: of PyTorch's CPU builds, which are not on PyPI.
+
+    ``lidar``: a lock of what the estimators of a lidar need, of which the names count. ``kilted``: one of
+    the wheels of ROS 2 Kilted, which count alone.
     """
     parts: dict[str, list[str]] = {kind: [] for kind in (*KINDS, "locked_lidar", "locked_cpu")}
     of_lidar = set(re.findall(r"(?m)^([\w.-]+)==", lidar.read_text()))
-    for entry in filter(str.strip, re.split(r"(?m)^(?=[A-Za-z0-9])", whole.read_text())):
+    for entry in _entries(whole):
         kind = next(kind for kind, begin in KINDS.items() if re.match(begin, entry))
         if kind == "locked" and entry.partition("==")[0] in of_lidar:
             kind = "locked_lidar"
@@ -24,6 +29,7 @@ def main(whole: Path, lidar: Path, torch_hashes: list[str]) -> None:
             # A version of its own: where an index has no CPU build, pip says so at once.
             build = [entry.split()[0] + "+cpu", *(f"--hash=sha256:{one}" for one in torch_hashes)]
             parts["locked_cpu"].append(" \\\n    ".join(build) + "\n")
+    parts["locked_ros_kilted"] = [f"{entry.rstrip()}\n" for entry in _entries(kilted) if entry.startswith("ros-")]
     for kind, entries in parts.items():
         path = REQUIREMENTS / f"{kind}.txt"
         comments = [line for line in path.read_text().splitlines(keepends=True) if line.startswith("#")]
@@ -31,4 +37,4 @@ def main(whole: Path, lidar: Path, torch_hashes: list[str]) -> None:
 
 
 if __name__ == "__main__":
-    main(Path(sys.argv[1]), Path(sys.argv[2]), sys.argv[3:])
+    main(*map(Path, sys.argv[1:4]), sys.argv[4:])

