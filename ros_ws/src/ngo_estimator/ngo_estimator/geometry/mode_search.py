@@ -29,12 +29,10 @@ class Mixture:
     log_weights: Array
 
     def widened(self, metres: float, radians: float) -> "Mixture":
-        """The same where the last hypothesis has at least these deviations."""
-        deviations, logs = self.deviations.copy(), self.log_weights.copy()
-        deviations[-1] = np.maximum(deviations[-1], (metres, radians))
+        """The last hypothesis alone, with at least these deviations."""
+        deviations = np.maximum(self.deviations[-1:], (metres, radians))
         ratio = np.log(deviations[-1] / self.deviations[-1])
-        logs[-1] -= 2.0 * ratio[0] + ratio[1]
-        return Mixture(self.means, deviations, logs)
+        return Mixture(self.means[-1:], deviations, self.log_weights[-1:] - 2.0 * ratio[0] - ratio[1])
 
     def log(self, pose: Array) -> float:
         """Logarithm of the density of the hypothesis that is likeliest at a pose ``(3,)``."""

@@ -136,6 +136,21 @@ def test_without_wheels_a_robot_that_starts_at_once_is_followed() -> None:
     assert off(steps, drive.reference.poses_xyyaw) < 0.5
 
 
+def test_without_wheels_a_log_that_keeps_a_scan_each_few_seconds_is_followed() -> None:
+    """As recorders thin logs: a scan each 0.7 m or 25 deg, seconds apart."""
+    poses = [np.array((1.0, 1.0, 0.3))]
+    for step in [(0.7, 0.0, 0.0), (0.0, 0.0, 0.44), (0.7, 0.1, 0.1), (0.3, 0.0, 0.44), (0.0, 0.0, 0.44)] * 3:
+        poses.append(compose(poses[-1], np.array(step)))
+    times_s = np.cumsum(np.random.default_rng(0).uniform(2.0, 9.0, len(poses)))
+    scans = [
+        replace(scan(ROOM, pose, k), stamp_ns=10**12 + int(1e9 * at_s))
+        for k, (pose, at_s) in enumerate(zip(poses, times_s, strict=True))
+    ]
+    steps = fed(scans)
+    assert not any(step.segment for step in steps)
+    assert off(steps, np.array(poses)) < 0.1
+
+
 def test_a_robot_that_was_carried_while_all_was_silent_begins_a_segment() -> None:
     there = records(way(20))
     away = [

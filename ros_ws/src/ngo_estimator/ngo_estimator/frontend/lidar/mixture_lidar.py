@@ -195,8 +195,9 @@ class MixtureLidar:
         sweep = self._sweep(scan, at_s, gap_s)
         key = self._key_scan(scan, sweep)
         again = None if sweep is None else partial(self._swept_again, scan, sweep, gap_s)
-        silent = gap_s > self.config.silent_s and (by_wheels is None or self._wheels_paused(at_s - gap_s, at_s))
         gap = gap_s / max(self._period.period_s, 1e-3)
+        long = gap_s > self.config.silent_s and gap > self.config.most_gap
+        silent = long and (by_wheels is None or self._wheels_paused(at_s - gap_s, at_s))
         estimate = self._core.update(key, by_wheels, counted, gap, silent, again)
         if self._wheels is not None and not estimate.unsure:
             self._wheels.observe_turn(self._last_s, at_s, float(estimate.step[2]))

@@ -47,6 +47,12 @@ _OPEN_SHARE = 1e-6
 _LEAST_WEIGHT = 0.1
 """Of the prior, where each scan fits: the walls of simulators are perfect, and what follows is not."""
 
+LIKELY, ANYWHERE, EVERYWHERE = range(3)
+"""Windows of the search: what hypotheses say, anything too, and as far as it is looked."""
+
+_FIRST_USUAL = 0.9
+"""Score that is expected of the first match."""
+
 _FEWEST = 12
 """Points without which a scan does not contradict what was seen."""
 
@@ -107,7 +113,7 @@ class MixtureOdometry:
         self._pose, self._covariance = np.zeros(3), np.zeros((3, 3))
         self._key = np.zeros(3)
         self._reckoned = np.zeros(2)  # way and turn since a scan fitted
-        self._usual = 0.0
+        self._usual = 0.0  # score, once a scan was matched
         self._doubt = self._doubted_key = np.zeros((3, 3))  # that other modes leave: of this scan, of a last key scan
         last = config.icp
         self._last_steps = replace(
@@ -246,25 +252,26 @@ class MixtureOdometry:
         points = few.points
         if not len(points):
             return None
-        weight, starts, fits = self._weight(points), self._starts(), list[_Mode]()
-        for wide in (False, True):
-            prior = self._prior(None, wide)
-            fits = [self._fit(few, k, None, weight, wide) for k in starts]
+        weight, starts, usual = self._weight(points), self._starts(), self._usual or _FIRST_USUAL
+        for reach in (LIKELY, ANYWHERE, EVERYWHERE):
+            prior = self._prior(None, reach == EVERYWHERE)
+            fits = [self._fit(few, k, None, weight, reach == EVERYWHERE) for k in starts]
             for pose, _ in two_modes(
-                self._submap.field, points, self._window(prior, wide), prior, weight,
+                self._submap.field, points, self._window(prior, reach), prior, weight,
                 (config.apart_m, math.radians(config.apart_deg)), config.margin * weight,
             ):  # fmt: skip
                 if not any(self._is_same(pose, other.pose) for other in fits):
-                    fit = self._fit(few, ANY, pose, weight, wide)
+                    fit = self._fit(few, ANY, pose, weight, reach == EVERYWHERE)
                     fits.append(replace(fit, total=fit.total - config.noise * weight))
             fits.sort(key=lambda fit: -fit.total)
-            if self._fits(points, fits[0].pose):
-                return self._doubted([self._sharpened(scan, few, fits[0]), *fits[1:]], weight)
+            best = fits[0]
+            if best.score >= config.new_share * usual or (reach != LIKELY and self._fits(points, best.pose)):
+                return self._doubted([self._sharpened(scan, few, best), *fits[1:]], weight)
         return None
 
     def _fits(self, points: Array, pose: Array) -> bool:
         """Whether those of the points that lie where something was seen fit; few contradict nothing."""
-        least = self.config.lost_share * self._usual
+        least = self.config.lost_share * (self._usual or _FIRST_USUAL)
         known = self._submap.field.scores(points, pose[None], least)[0]
         return len(points) < _FEWEST or bool(known > least + 1e-6)  # rounding
 
@@ -295,13 +302,14 @@ class MixtureOdometry:
         distinct: list[int] = usable[_distinct(mixture.steps[usable], deviations[usable], *same)].tolist()
         return distinct
 
-    def _window(self, prior: Mixture, wide: bool) -> SearchWindow:
+    def _window(self, prior: Mixture, reach: int) -> SearchWindow:
         config = self.config
         centre = prior.means[int(prior.log_weights.argmax())].copy()
         most_m, most_rad = config.most_window_m, math.pi
-        if wide:
+        if reach == EVERYWHERE:
             return SearchWindow(centre, most_m, most_rad, math.radians(config.heading_step_deg))
-        metres, radians = _reach(prior.means[:-1], prior.deviations[:-1], centre)
+        last = len(prior.means) - (reach == LIKELY)
+        metres, radians = _reach(prior.means[:last], prior.deviations[:last], centre)
         return SearchWindow(
             centre,
             min(max(metres, config.least_window_m), most_m),

@@ -227,10 +227,10 @@ def _grown(
         turn = abs(steps[k, 2]) if k not in (NONE, ANY) else 0.0
         base[k, 0] = still_m + way_share * way + turn_m * turn
         base[k, 1] = still_rad + turn_share * turn + way_rad * way
+    base[ANY, 0], base[ANY, 1] = anything
     deviations = factors * base
-    for k in (LAST, VELOCITY, NONE):
+    for k in (LAST, VELOCITY, NONE, ANY):
         deviations[k] *= longer
-    deviations[ANY, 0], deviations[ANY, 1] = anything[0] * longer, anything[1] * longer
     return base, deviations
 
 
