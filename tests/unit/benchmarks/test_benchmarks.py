@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import torch
 
-from benchmarks import drives
+from benchmarks import camera_live, drives
 from benchmarks.core_speed import Watched, core_speed
 from benchmarks.drives import Drive, drive_of, episodes, stamp_ns
 from benchmarks.lidar_live import RATE_HZ, Arguments, frames_of
@@ -20,6 +20,7 @@ from ngo_estimator.nodes.messages import to_ns
 from ngo_estimator.slam.corrected_trajectory import CorrectedTrajectory
 from ngo_estimator.slam.online_trajectory import OnlineTrajectory
 from ngo_sim.episodes import record_episode
+from tests.unit.ngo_estimator import rendered_room
 from tests.unit.ngo_estimator.slam.test_online_trajectory import make_steps
 from tests.unit.ngo_estimator.slam.test_saved_state import lidar_drive, networks, scans
 from training.baselines.pose_graph import xyyaw
@@ -176,6 +177,20 @@ def test_the_scans_are_of_the_asked_size_at_40_hz() -> None:
     assert {len(scan.ranges) for scan in scans} == {1080}
     stamps = [to_ns(scan.header.stamp) for scan in scans]
     assert [b - a for a, b in zip(stamps[:-1], stamps[1:], strict=True)] == pytest.approx([1e9 / RATE_HZ] * 100, abs=2)
+
+
+def test_each_picture_comes_with_its_calibration_and_the_wheels() -> None:
+    model, truth = rendered_room.camera(160), rendered_room.drive(8)
+    rays, truth = rendered_room.rays_of(model), se2.between(truth[:1], truth)
+    pictures = [rendered_room.picture(model, rays, pose)[..., 0] for pose in rendered_room.drive(8)]
+    frames = camera_live.frames_of(camera_live.CameraDrive(pictures, truth, truth, model, 0.1))
+    for number, ((_, image), (_, info), (_, wheels)) in enumerate(frames):
+        assert to_ns(image.header.stamp) == to_ns(wheels.header.stamp) == 1_000_000_000 + round(number * 1e9 / 15.0)
+        assert np.array_equal(np.reshape(image.data, (120, 160)), pictures[number])
+        assert np.allclose(np.reshape(info.k, (3, 3)), model.matrix)
+        at = wheels.pose.pose
+        assert (at.position.x, at.position.y, 2.0 * at.orientation.z) == pytest.approx(tuple(truth[number]), abs=0.05)
+    assert camera_live.keys_per_s(np.outer(np.arange(15.0), (0.4, 0.0, 0.0))) == pytest.approx(7.0)  # each 0.8 m
 
 
 def test_a_process_has_used_time_and_memory() -> None:
