@@ -2,10 +2,13 @@
 
 import math
 
+import cv2
 import numpy as np
 import pytest
 
 from ngo_estimator.data.relative_step import RelativeStep
+from ngo_estimator.frontend.camera import tracked_odometry
+from ngo_estimator.frontend.camera.feature_tracks import corners, followed, found_from_elsewhere
 from ngo_estimator.frontend.camera.picture_odometry import PictureOdometry
 from ngo_estimator.frontend.camera.tracked_odometry import _likelier
 from ngo_estimator.geometry.planar_motion import between
@@ -102,3 +105,35 @@ def test_a_texture_that_repeats_leaves_the_turn_as_open_as_the_wheels_do() -> No
     for far_rad, least_rad, most_rad in ((0.07, 0.018, 0.0201), (0.01, 0.007, 0.008)):
         covariance = _likelier(view(0.0, 40), view(far_rad, 60), given).covariance
         assert least_rad < math.sqrt(covariance[2, 2]) < most_rad
+
+
+def test_corners_of_stripes_are_found_only_where_they_are_expected() -> None:
+    noise = cv2.GaussianBlur(np.random.default_rng(2).integers(0, 256, (120, 160), np.uint8), (0, 0), 2.5)
+    stripes = np.tile(noise[:, :12], (1, 14))[:, :160]
+    for grey, shares in ((cv2.equalizeHist(noise), (0.9, 1.0)), (cv2.equalizeHist(stripes), (0.0, 0.2))):
+        at = corners(grey, 60, 6.0, np.zeros((0, 2)))
+        at = at[(at > 25.0).all(1) & (at < (135, 95)).all(1)]
+        there, found = followed(grey, grey, at, at)
+        again = found_from_elsewhere(grey, grey, at, there, at + (8.0, 0.0))
+        assert len(at) > 10 and found.all() and shares[0] <= again.mean() <= shares[1]
+
+
+def test_a_picture_is_no_surer_than_the_wheels_where_corners_are_found_only_where_they_are_expected(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    model, truth = camera(160), drive(6)
+    rays, wheels = rays_of(model), by_wheels(truth)
+
+    def driven() -> list[RelativeStep]:
+        odometry, steps = PictureOdometry(model), list[RelativeStep]()
+        for k, pose in enumerate(truth):
+            odometry.add_wheels(k * PERIOD_NS, wheels[k])
+            odometry.add_picture(k * PERIOD_NS, picture(model, rays, pose))
+            steps += odometry.ready()
+        return steps
+
+    sure = driven()
+    monkeypatch.setattr(tracked_odometry, "found_from_elsewhere", lambda *args: np.zeros(len(args[2]), bool))
+    for step, unsure in zip(sure, driven(), strict=True):
+        assert np.array_equal(step.relative_xyyaw, unsure.relative_xyyaw)
+        assert math.sqrt(step.covariance[2, 2]) < 0.01 < math.sqrt(unsure.covariance[2, 2]) < 0.03

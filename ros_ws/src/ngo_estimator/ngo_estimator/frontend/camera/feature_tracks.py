@@ -37,6 +37,19 @@ def followed(before: Grey, now: Grey, pixels: Array, guess: Array) -> tuple[Arra
     return at, (found.ravel() == 1) & (again.ravel() == 1) & (off < _BACK_PX) & inside
 
 
+def found_from_elsewhere(before: Grey, now: Grey, pixels: Array, there: Array, elsewhere: Array) -> np.ndarray:
+    """Which corners ``(n,)`` that were followed are found again where the search back begins ``elsewhere`` ``(n, 2)``.
+
+    Of a texture that repeats the others are not: what was found is what was expected.
+    """
+    if len(pixels) == 0:
+        return np.zeros(0, bool)
+    start, hint = (np.ascontiguousarray(at, np.float32).reshape(-1, 1, 2) for at in (there, elsewhere))
+    flags = cv2.OPTFLOW_USE_INITIAL_FLOW
+    back, again, _ = cv2.calcOpticalFlowPyrLK(now, before, start, hint, None, None, _WINDOW, 1, _STOP, flags)
+    return (again.ravel() == 1) & (np.linalg.norm(back.reshape(-1, 2) - pixels, axis=1) < _BACK_PX)
+
+
 def corners(grey: Grey, most: int, apart_px: float, taken: Array) -> Array:
     """New corners ``(n, 2)``, at most ``most``, away from each other and from those that are followed ``(m, 2)``."""
     if most <= 0:

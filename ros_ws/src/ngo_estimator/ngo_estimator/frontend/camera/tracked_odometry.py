@@ -12,7 +12,7 @@ from dataclasses import replace
 import numpy as np
 
 from ngo_estimator.frontend.camera.camera_config import CameraConfig
-from ngo_estimator.frontend.camera.feature_tracks import Grey, corners, followed
+from ngo_estimator.frontend.camera.feature_tracks import Grey, corners, followed, found_from_elsewhere
 from ngo_estimator.geometry import se2
 from ngo_estimator.geometry.camera_model import CameraModel
 from ngo_estimator.geometry.planar_motion import between, compose, turned_covariance, wrap
@@ -42,6 +42,12 @@ _RANSAC_SAMPLES, _RANSAC_PX = 60, 2.0
 _MOST_SURPRISE = 4.0
 """Deviations of the given motion beyond which a fit is taken to have failed."""
 
+_OFF = 2.0
+"""Deviations of the heading by which corners are also looked for elsewhere."""
+
+_SURE_SHARE = 0.3
+"""Where fewer of the corners that agree are found from elsewhere, too, a picture is no surer than what was given."""
+
 _HELD = 100.0
 
 _VARIANCES = np.array((1e-8, 1e-8, 1e-9))
@@ -64,6 +70,7 @@ class TrackedOdometry:
         self._grey: Grey | None = None
         self._pixels = np.zeros((0, 2))
         self._points = RangedRays(np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0), np.zeros(0))
+        self._sure = np.zeros(0, bool)  # which were found where they are, wherever one begins to look
         self._begin_step()
 
     @property
@@ -122,7 +129,19 @@ class TrackedOdometry:
         size = grey.shape[::-1]
         near = ahead & (guess > 0.0).all(1) & (guess < size).all(1)
         at, found = followed(self._grey, grey, self._pixels, np.where(near[:, None], guess, self._pixels))
+        given = between(self.pose, predicted)
+        std = math.sqrt(self._turn_variance(math.hypot(given[0], given[1]), abs(given[2]), 1))
+        turned, _ = self._model.pixels(base_vectors(self._points, predicted + (0.0, 0.0, _OFF * std), self._centre_now))
+        either_way = np.where(np.arange(len(at)) % 2, 1.0, -1.0)[:, None]
+        elsewhere = self._pixels + either_way * np.where(near[:, None], turned - guess, 0.0)
+        self._sure = found_from_elsewhere(self._grey, grey, self._pixels, at, elsewhere)[found & near]
         self._keep(found & near, at)
+
+    def _turn_variance(self, way: float, turn: float, frames: float) -> float:
+        """Of the given heading, after a way (m) and a turn (rad) in so many frames."""
+        config = self._config
+        share, drift = config.given_turn_share * turn, config.given_rad_per_m * way
+        return share**2 + drift**2 + frames * config.given_rad**2
 
     def _keep(self, which: np.ndarray, pixels: Array) -> None:
         self._pixels, self._points, self._from_rays = pixels[which], self._points[which], self._from_rays[which]
@@ -132,8 +151,8 @@ class TrackedOdometry:
         """The given motion since the last step: a pose ``(3,)``, and its covariance ``(3, 3)``."""
         config = self._config
         along = (config.given_way_share * self._way) ** 2 + self._frames * config.given_m**2
-        turn = (config.given_turn_share * self._turn) ** 2 + (config.given_rad_per_m * self._way) ** 2
-        covariance = np.diag((along, along, turn + self._frames * config.given_rad**2) + self._unknown)
+        turn = self._turn_variance(self._way, self._turn, self._frames)
+        covariance = np.diag((along, along, turn) + self._unknown)
         return compose(self._from, self._given), covariance
 
     @property
@@ -172,7 +191,10 @@ class TrackedOdometry:
         trusted = (
             fitted.inlier.sum() >= self._config.least_inliers and off[2] ** 2 < _MOST_SURPRISE**2 * covariance[2, 2]
         )
-        return fitted if trusted else alone
+        if not trusted:
+            return alone
+        sure = (fitted.inlier & self._sure).sum() >= _SURE_SHARE * fitted.inlier.sum()
+        return fitted if sure else replace(fitted, covariance=covariance)
 
     def _deviations(self, seen: Array, predicted: Array) -> Array:
         """Of rays ``(n,)``, rad: corners that moved far against what is far away are followed worse."""
