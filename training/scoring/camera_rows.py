@@ -2,16 +2,19 @@
 
 import time
 from dataclasses import dataclass
-from typing import Literal
+from typing import Any, Literal
 
 import cv2
 import numpy as np
 
+from ngo_estimator.frontend.camera import tracked_odometry
 from ngo_estimator.frontend.camera.camera_config import CameraConfig
 from ngo_estimator.frontend.camera.picture_odometry import PictureOdometry
 from ngo_estimator.geometry import se2
 from ngo_estimator.geometry.camera_model import CameraModel, tilted
+from ngo_estimator.geometry.planar_views import epipolar_errors, ransac
 from ngo_estimator.graph.corrector import CorrectedGraph, GraphProblem
+from ngo_estimator.loops import picture_fit
 from ngo_estimator.slam.picture_back_end import PictureBackEnd
 from ngo_estimator.slam.picture_trajectory import PictureTrajectory
 from ngo_sim.episodes import record_episode
@@ -21,9 +24,15 @@ from training.data.doom_drives import Map
 from training.scoring.metrics import absolute_error_m, path_length_m, trajectory_error, within
 from training.scoring.table import Measured
 
-Ablation = Literal["nothing", "tracks", "sift", "corrector"]
+Ablation = Literal["nothing", "tracks", "points", "planar", "sift", "corrector"]
 
 _EYE_M = 0.8
+_AHEAD = 0.2
+"""Forward part of a ray that the plane of a picture holds."""
+
+_OPTICAL = np.array(((0.0, -1.0, 0.0), (0.0, 0.0, -1.0), (1.0, 0.0, 0.0)))
+"""Axes of optics (right, down, ahead) by those of the base."""
+
 _WRONG_M, _WRONG_RAD = 0.5, np.radians(5.0)
 """A loop that is off by more is wrong."""
 
@@ -109,9 +118,40 @@ class _BelievingTrajectory(PictureTrajectory):
         return back_end
 
 
+def five_points(
+    first: np.ndarray,
+    second: np.ndarray,
+    tolerance_rad: np.ndarray | float,
+    samples: int,
+    near: tuple[float, float] = (0.0, np.pi),
+) -> tuple[np.ndarray, np.ndarray] | None:
+    """As ``planar_views.ransac``, by five points of any motion (Nister 2004), whose yaw and direction count."""
+    ahead = np.flatnonzero((first[:, 0] > _AHEAD) & (second[:, 0] > _AHEAD))
+    if len(ahead) < 5:
+        return None
+    (a, b), tolerance = (-rays[ahead, 1:] / rays[ahead, :1] for rays in (first, second)), np.median(tolerance_rad)
+    essential, agree = cv2.findEssentialMat(
+        a, b, np.eye(3), cv2.RANSAC, prob=0.999, threshold=float(tolerance), maxIters=samples
+    )
+    if essential is None or essential.shape != (3, 3):
+        return None
+    _, turn, moved, _ = cv2.recoverPose(essential, a, b, np.eye(3), mask=agree)
+    back = (_OPTICAL.T @ turn @ _OPTICAL).T  # in base axes: from the second picture's to the first's
+    motion = np.array((np.arctan2(back[1, 0], back[0, 0]), np.arctan2(*(-back @ _OPTICAL.T @ moved)[1::-1, 0])))
+    if abs(se2.wrap(motion[0] - near[0])) > near[1]:
+        return None
+    return motion, epipolar_errors(first, second, motion[:1], motion[1:])[0] < tolerance_rad
+
+
 def estimators(camera: CameraModel, without: Ablation) -> tuple[PictureOdometry, PictureTrajectory]:
-    """Both estimators, without their tracked corners, SIFT (ORB stands for it) or the robust corrector."""
-    config = CameraConfig(least_inliers=CameraConfig.corners + 1) if without == "tracks" else CameraConfig()
+    """Both estimators, without tracked corners, their ranges, the planar solver, SIFT (ORB) or the robust corrector."""
+    settings: dict[str, Any] = {
+        "tracks": {"least_inliers": CameraConfig.corners + 1},
+        "points": {"range_pixel_std": 1e6},
+    }
+    config = CameraConfig(**settings.get(without, {}))
+    for module in (tracked_odometry, picture_fit):
+        module.ransac = five_points if without == "planar" else ransac  # type: ignore[attr-defined]
     odometry = PictureOdometry(camera, config, _Orb(config.features) if without == "sift" else None)
     return odometry, _BelievingTrajectory() if without == "corrector" else PictureTrajectory()
 
