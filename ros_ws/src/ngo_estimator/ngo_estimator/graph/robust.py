@@ -1,8 +1,8 @@
 """The robust corrector: no network, and right with most loops wrong.
 
 Two methods give a solution: graduated non-convexity over all loops that the cycles do not rule out, and belief in the
-surest loops first. What each solution predicts lets more loops in. One cost judges between all. Covariances that
-are not as stated are scaled. Cycles of loops that know the whole relative pose measure the scale before anything is
+surest loops first. Where one factor does not hold all of these, graduated non-convexity tries two choices of them. What
+each solution predicts lets more loops in. One cost judges between all. Covariances that are not as stated are scaled. Cycles of loops that know the whole relative pose measure the scale before anything is
 solved, and the residuals of what is believed measure it afterwards.
 """
 
@@ -41,8 +41,9 @@ _GROWN = 1.25
 _MOST_FILLED = 2_000_000
 """Blocks that one factorisation may multiply: where loops would fill it, some of them are tried."""
 
-_CELL = 40
-"""Nodes: loops whose ends are, both, within one cell of the chain say nearly the same."""
+_CELLS = (20, 40)
+"""Nodes: loops whose ends are, both, within one cell of the chain say nearly the same. Where a factor holds not all
+loops, those that are tried depend on the cells."""
 
 _FEWER = 0.7
 """How many loops are tried where those before are too many."""
@@ -110,19 +111,21 @@ def _from_nothing(problem: GraphProblem, told: Told, least_scale: float) -> Corr
         scale = _noticed(scale, least_scale)
         scaled = problem.scaled(scale)
     odds = cycle_odds(ChainUncertainty(scaled.steps), scaled.loops, area, inlier_ratio)
-    begun, rows = replace(scaled, poses=chain), _spread(scaled.loops.nodes, odds)
-    likely, structure = _affordable(begun, rows[: np.count_nonzero(odds > 0.0)])
-    nothing = np.zeros(len(likely.loops), bool)
-    solutions = [
-        graduate(likely, chain, told=told, structure=structure)[0],
-        believe(likely, chain, nothing, area, inlier_ratio, told, structure)[0],
-    ]
+    begun, solutions = replace(scaled, poses=chain), []
+    for cell in _CELLS:
+        rows = _spread(scaled.loops.nodes, odds, cell)[: np.count_nonzero(odds > 0.0)]
+        likely, structure = _affordable(begun, rows)
+        solutions.append(graduate(likely, chain, told=told, structure=structure)[0])
+        if len(likely.loops) == len(rows):
+            nothing = np.zeros(len(rows), bool)
+            solutions.append(believe(likely, chain, nothing, area, inlier_ratio, told, structure)[0])
+            break
     different = {scaled.fits(poses).tobytes(): poses for poses in solutions}  # what believes the same ends at the same
     solutions += [_looked_again(scaled, poses, area, inlier_ratio, told) for poses in different.values()]
     best = min(solutions, key=lambda poses: truncated_cost(scaled, poses))
     fits, let_in = scaled.fits(best)[~metric], odds[~metric] > 0.0
     if not metric.all() and (fits & let_in).sum() <= _AGREE * (fits | let_in).sum():
-        everything, structure = _affordable(begun, rows)
+        everything, structure = _affordable(begun, _spread(scaled.loops.nodes, odds, _CELLS[0]))
         poses = graduate(everything, chain, told=told, structure=structure)[0]
         best = min(best, poses, key=lambda poses: truncated_cost(scaled, poses))
     solution = _polished(problem, best, scale, len(problem.loops), least_scale)
@@ -153,12 +156,12 @@ def _warm(problem: GraphProblem, start: CorrectedGraph, told: Told, least_scale:
     return _polished(problem, poses, start.scale, start.loops_from_nothing, least_scale)
 
 
-def _spread(nodes: np.ndarray, odds: np.ndarray) -> np.ndarray:
+def _spread(nodes: np.ndarray, odds: np.ndarray, cell: int) -> np.ndarray:
     """An order of loops ``(loops,)``: the likeliest of each cell, then the second ones, and those ruled out at the end.
 
     The likeliest of all lie where the chain is short and leave most of a long one alone.
     """
-    cells = np.unique(nodes // _CELL, axis=0, return_inverse=True)[1].ravel()
+    cells = np.unique(nodes // cell, axis=0, return_inverse=True)[1].ravel()
     order = np.lexsort((-odds, cells))
     first = np.searchsorted(cells[order], cells[order])
     rank = np.empty(len(odds), np.int64)
