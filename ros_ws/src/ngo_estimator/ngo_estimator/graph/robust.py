@@ -2,8 +2,9 @@
 
 Two methods give a solution: graduated non-convexity over all loops that the cycles do not rule out, and belief in the
 surest loops first. Where one factor does not hold all of these, graduated non-convexity tries two choices of them. What
-each solution predicts lets more loops in. One cost judges between all. Covariances that are not as stated are scaled. Cycles of loops that know the whole relative pose measure the scale before anything is
-solved, and the residuals of what is believed measure it afterwards.
+each solution predicts lets more loops in. One cost judges between all. Covariances that are not as stated are scaled.
+Cycles of loops that know the whole relative pose measure the scale before anything is solved, and the residuals of
+what is believed measure it afterwards.
 """
 
 from dataclasses import replace
