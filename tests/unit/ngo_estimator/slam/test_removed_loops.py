@@ -89,11 +89,13 @@ def test_what_is_thought_of_loops_is_counted_and_the_newest_refused_one_explaine
     assert (report.believed, report.refused) == ((belief == 1.0).sum(), (belief == 0.0).sum())
     pairs, poses = np.array(((0, 1), (1, 2), (0, 2), (0, 3))), np.arange(4.0)[:, None] * (1.0, 0.0, 0.0)
     relative = np.array(((1.0, 0.0, 0.0), (1.0, 0.0, 0.0), (2.0, 3.0, 0.0), (3.0, 0.0, 0.5)))
-    counted = loop_report(pairs, relative, np.array((1.0, 0.3, 0.0, 0.05)), 2, 10**9 * np.arange(1, 5), poses)
-    assert (counted.believed, counted.doubted, counted.refused) == (1, 3, 2)
+    counted = loop_report(
+        pairs, relative, np.array((1.0, 0.3, 0.0, 0.05)), 2, 10**9 * np.arange(1, 5), poses, (1.0, 4.0)
+    )
+    assert (counted.believed, counted.doubted, counted.refused, counted.scales) == (1, 3, 2, (1.0, 4.0))
     assert counted.newest_refused == "from 1.000 s to 4.000 s: 0 m and 28.6 deg off what all others say"
-    nothing = loop_report(pairs[:0], relative[:0], np.zeros(0), 0, np.arange(4), poses)
-    assert nothing == LoopReport(0, 0, 0, "")
+    nothing = loop_report(pairs[:0], relative[:0], np.zeros(0), 0, np.arange(4), poses, (1.0, 1.0))
+    assert nothing == LoopReport(0, 0, 0, "", (1.0, 1.0))
 
 
 def test_pictures_lose_a_loop_and_a_stretch(pictures: OnlineTrajectory) -> None:

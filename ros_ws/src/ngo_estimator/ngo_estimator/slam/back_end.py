@@ -60,6 +60,8 @@ class BackEnd(ABC):
         """What failed in the last ``work`` or ``finish``, in words; empty where nothing did."""
         self.took_s = 0.0
         """Computing time of the last work that ended with an optimisation."""
+        self.scales = 1.0, 1.0
+        """How many times as large as stated the last optimisation found the variances of steps and of loops."""
 
     @abstractmethod
     def checked(self, step: RelativeStep) -> RelativeStep:

@@ -275,7 +275,7 @@ class CorrectedTrajectory(ABC):
         """What the last optimisation thinks of the loops."""
         back_end, closed = self._back_end, self._back_end.closed
         seen = closed.pairs, closed.relative, closed.weight, back_end.waiting_loops
-        return loop_report(*seen, self._log.stamps_ns.values, back_end.graph.frame_poses())
+        return loop_report(*seen, self._log.stamps_ns.values, back_end.graph.frame_poses(), back_end.scales)
 
     def trajectory(self) -> Trajectory | None:
         """The whole trajectory as it is now, or None before the first step."""

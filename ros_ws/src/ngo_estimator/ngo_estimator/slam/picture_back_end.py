@@ -93,6 +93,7 @@ class PictureBackEnd(BackEnd):
         end = solution.covariance([len(self.graph) - 1]) if len(self.graph) > 1 else self.graph.end
         require_sound(solution.poses, end)
         self._loops_from_nothing, self._scale = solution.loops_from_nothing, np.array((solution.scale,))
+        self.scales = solution.step_scale, solution.loop_scale
         self.graph.move(solution.poses, end)
         found, weights = self._finder.loops, solution.loop_weights
         variance = np.diagonal(found.covariance, axis1=1, axis2=2) / np.maximum(weights, 1e-12)[:, None]

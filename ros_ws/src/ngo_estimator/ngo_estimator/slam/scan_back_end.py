@@ -343,6 +343,7 @@ class ScanBackEnd(BackEnd):
         for end in ends:
             require_sound(solution.poses, end if end.any() else np.eye(3))  # none where the map begins
         self._loops_from_nothing, self._scale = solution.loops_from_nothing, np.array((solution.scale,))
+        self.scales = solution.step_scale, solution.loop_scale
         self.graph.move(solution.poses, *ends)
         self._close(loops, solution.loop_weights)
         self._parts = parts
