@@ -133,41 +133,26 @@ def not_finite(path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("damage", "complaint"),
+    ("suffix", "damage", "complaint"),
     [
-        (Path.unlink, "cannot be read"),
-        (pipe, r"cannot be read \(it is no regular file\)"),
-        *((cut(size), "damaged or no safetensors") for size in (0, 100, -1)),
-        (one_wrong_bit, "sha256"),
-        (lambda path: path.write_bytes(pickle.dumps(Trap())), "damaged or no safetensors"),
-        (lambda path: torch.save({"trap": Trap()}, path), "damaged or no safetensors"),
-        (not_finite, r"not finite in hidden\.weight"),
-    ],
-)
-def test_every_damage_of_weights_is_one_line(damage: Callable[[Path], object], complaint: str, weights: Path) -> None:
-    path = weights / f"{LOCAL}.safetensors"
-    damage(path)
-    with pytest.raises(CheckpointError, match=complaint) as error:
-        load_local(weights)
-    assert_one_line(error.value, path.name)
-
-
-@pytest.mark.parametrize(
-    ("damage", "complaint"),
-    [
-        (Path.unlink, "cannot be read"),
-        (pipe, r"cannot be read \(it is no regular file\)"),
-        (of_another_network, f"describes a '{PLACE}'; expected a '{LOCAL}'"),
+        *((suffix, Path.unlink, "cannot be read") for suffix in ("safetensors", "json")),
+        *((suffix, pipe, r"cannot be read \(it is no regular file\)") for suffix in ("safetensors", "json")),
+        *(("safetensors", cut(size), "damaged or no safetensors") for size in (0, 100, -1)),
+        ("safetensors", one_wrong_bit, "sha256"),
+        ("safetensors", lambda path: path.write_bytes(pickle.dumps(Trap())), "damaged or no safetensors"),
+        ("safetensors", lambda path: torch.save({"trap": Trap()}, path), "damaged or no safetensors"),
+        ("safetensors", not_finite, r"not finite in hidden\.weight"),
+        ("json", of_another_network, f"describes a '{PLACE}'; expected a '{LOCAL}'"),
         *(
-            (lambda path, content=content: path.write_bytes(content), None)
+            ("json", lambda path, content=content: path.write_bytes(content), None)
             for content in (b"", b"{", b"[]", b"null", b"\xff\xfe\x00", b'{"format": 99}', b"[" * 10**6)
         ),
     ],
 )
-def test_every_damage_of_a_description_is_one_line(
-    damage: Callable[[Path], object], complaint: str | None, weights: Path
+def test_every_damage_of_weights_and_of_their_description_is_one_line(
+    suffix: str, damage: Callable[[Path], object], complaint: str | None, weights: Path
 ) -> None:
-    path = weights / f"{LOCAL}.json"
+    path = weights / f"{LOCAL}.{suffix}"
     damage(path)
     with pytest.raises(CheckpointError, match=complaint) as error:
         load_local(weights)
