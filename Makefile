@@ -57,7 +57,7 @@ train: build ## every network: WORLD=maze3d|maze2d, or DATA="a.mcap b.mcap" NAME
 		case $$script in train_familiarity) own= ;; train_*) own="$(TRAIN_ARGS)" ;; *) own= ;; esac; \
 		python -m training.$$script $(if $(DATA),--data $(DATA) --name $(NAME),--world $(WORLD)) $(ARGS) $$own || exit; done
 
-results: build ## tables and figures of a world, from networks to docs/: WORLD=maze3d|maze2d|scan|stress|doom|camera|graphs|explore|lifelong
+results: build ## tables and figures of a world, from networks to docs/: WORLD=maze3d|maze2d|scan|stress|map|relocalisation|doom|camera|graphs|explore|lifelong|faults
 	$(WHOLE)
 	@$(OPEN) && exec python -m training.results --world $(WORLD) $(ARGS)
 

@@ -2,24 +2,18 @@
 
     python -m training.results --world maze2d
     python -m training.results --world maze3d
-    python -m training.results --world scan      # of the lidar: training.results_scan
-    python -m training.results --world camera    # of a calibrated camera: training.results_camera
-    python -m training.results --world doom      # of other Doom maps: training.results_doom
-    python -m training.results --world graphs    # of graphs with wrong loops: training.results_graphs
-    python -m training.results --world explore   # of exploration: training.results_explore
-    python -m training.results --world lifelong  # of several robots on one map: training.results_lifelong
-    python -m training.results --world stress    # of changed logs of a lidar: training.results_stress
+    python -m training.results --world scan      # of the lidar, and so on: TABLES
 
 Missing networks, features, settings of the pose graph and trainings of the optimizers are made first. Every row is
 measured in mazes that nothing was trained or chosen on. The command writes ``training/results/WORLD.json``,
 ``docs/results_WORLD.md`` and ``docs/images/results_WORLD_*.png``. Run it again to continue after a stop.
 """
 
+import argparse
 import json
-import re
 import sys
 from dataclasses import dataclass, replace
-from types import ModuleType
+from importlib import import_module
 from typing import Any, Literal
 
 import numpy as np
@@ -27,15 +21,6 @@ import numpy as np
 from ngo_estimator.loops import overlaps, pair_measurement
 from ngo_estimator.ngo import neural_graph_optimizer
 from ngo_estimator.trajectory import errors
-from training import (
-    results_camera,
-    results_doom,
-    results_explore,
-    results_graphs,
-    results_lifelong,
-    results_scan,
-    results_stress,
-)
 from training.common import records
 from training.common.command_line import check_at_least, run_command
 from training.data.feature_store import open_store
@@ -71,16 +56,13 @@ class Arguments(Folders):
             raise ValueError(f"prefixes are {self.prefixes}; expected numbers of steps, each at least 1")
 
 
-TABLES: dict[str, ModuleType] = {
-    "camera": results_camera,
-    "scan": results_scan,
-    "doom": results_doom,
-    "explore": results_explore,
-    "graphs": results_graphs,
-    "lifelong": results_lifelong,
-    "stress": results_stress,
+TABLES = {
+    **{
+        name: f"results_{name}" for name in ("camera", "doom", "explore", "graphs", "lifelong", "map", "scan", "stress")
+    },
+    **{name: name for name in ("faults", "relocalisation")},
 }
-"""The commands of tables that are not of a world of mazes."""
+"""The modules of tables that are not of a world of mazes."""
 
 _ATTENTION_TRAJECTORIES = 24
 _CODE = (row_estimators, prefix_errors_module, neural_graph_optimizer, overlaps, pair_measurement, errors)
@@ -185,9 +167,17 @@ def summary(
     }
 
 
-if __name__ == "__main__":
-    world = re.search(r"--world[= ](\w+)", " ".join(sys.argv))
-    if world and (table := TABLES.get(world[1])):
-        run_command(table.main, table.Arguments, table.__doc__)
+def command_line(arguments: list[str]) -> None:
+    """Make the table that ``--world`` names, with the other flags."""
+    parser = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
+    parser.add_argument("--world")
+    known, flags = parser.parse_known_args(arguments)
+    if known.world in TABLES:
+        table = import_module(f"training.{TABLES[known.world]}")
+        run_command(table.main, table.Arguments, table.__doc__, flags)
     else:
-        run_command(main, Arguments, __doc__)
+        run_command(main, Arguments, __doc__, arguments)
+
+
+if __name__ == "__main__":
+    command_line(sys.argv[1:])

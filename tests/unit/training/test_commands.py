@@ -5,11 +5,12 @@ import logging
 import subprocess
 import warnings
 from collections.abc import Iterator
+from pathlib import Path
 
 import pytest
 import tyro
 
-from training import train, train_smoother
+from training import results, train, train_smoother
 from training.common.command_line import quiet_framework, run_command
 from training.common.records import ROOT, RunError
 from training.recordings.recording_source import RecordedArguments
@@ -47,6 +48,20 @@ def test_a_task_gets_the_flags_behind_its_name(monkeypatch: pytest.MonkeyPatch) 
     monkeypatch.setattr(train_smoother, "main", given.append)
     train.main(["smoother", "--world", "maze3d", "--memory", "--seed", "7"])
     assert given == [train_smoother.Arguments(world="maze3d", memory=True, seed=7)]
+
+
+def test_every_table_is_one_of_the_one_command() -> None:
+    modules = {path.stem for path in (ROOT / "training").glob("results_*.py")} | {"faults", "relocalisation"}
+    assert {*results.TABLES.values()} == modules
+
+
+@pytest.mark.parametrize("world", ["scan", "map", "faults", "relocalisation"])
+def test_a_table_gets_the_flags_beside_its_name(world: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    given, table = [], importlib.import_module(f"training.{results.TABLES[world]}")
+    monkeypatch.setattr(table, "main", given.append)
+    for name in (["--world", world], [f"--world={world}"]):
+        results.command_line(["--runs", "here", *name])
+    assert given == 2 * [table.Arguments(runs=Path("here"))]
 
 
 def test_a_run_that_does_not_fit_ends_a_command_with_one_line(monkeypatch: pytest.MonkeyPatch) -> None:
