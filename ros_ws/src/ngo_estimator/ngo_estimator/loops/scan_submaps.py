@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ngo_estimator.data.state_arrays import Arrays, flat, part, require, split, taken, under
+from ngo_estimator.geometry import se2
 from ngo_estimator.geometry.branch_and_bound import PooledGrid, pooled_grid
 from ngo_estimator.geometry.key_scan import KeyScan
 from ngo_estimator.geometry.line_map import LineMap, line_map_of_points
@@ -65,7 +66,7 @@ class ScanSubmaps:
             borders = np.append(segments, len(scans))
             own = int(np.searchsorted(segments, place, side="right"))
             first, after = max(first, int(borders[own - 1])), min(after, int(borders[own]))
-        local = _between(poses[place], poses[first:after])
+        local = se2.between(poses[place], poses[first:after])
         submap = self._made(first, local, placed(scans[first:after], profiles[first:after], local))
         self._submaps[place] = submap
         if len(self._submaps) > self._config.most_submaps:
@@ -112,13 +113,4 @@ class ScanSubmaps:
 
 def laid_together(scans: Sequence[KeyScan], profiles: Sequence[np.ndarray], poses: np.ndarray) -> PlacedScans:
     """Scans at poses ``(scans, 3)``, in the frame of the last."""
-    return placed(scans, profiles, _between(poses[-1], poses))
-
-
-def _between(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """Poses ``(n, 3)`` seen from one pose ``(3,)``."""
-    a = np.broadcast_to(a, b.shape)
-    cosine, sine = np.cos(a[:, 2]), np.sin(a[:, 2])
-    x, y = b[:, 0] - a[:, 0], b[:, 1] - a[:, 1]
-    turn = (b[:, 2] - a[:, 2] + math.pi) % (2.0 * math.pi) - math.pi
-    return np.stack((cosine * x + sine * y, cosine * y - sine * x, turn), axis=-1)
+    return placed(scans, profiles, se2.between(poses[-1], poses))
