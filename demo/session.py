@@ -15,6 +15,7 @@ from nav_msgs.msg import Odometry
 from nav_msgs.msg import Path as PathMessage
 from rclpy.serialization import deserialize_message
 
+from benchmarks.process_use import memory_mb
 from demo.graph import Graph, GraphError, NodeSpec
 from demo.picture import save_picture
 from demo.recording import ALL_TOPICS, StampTimes
@@ -111,6 +112,7 @@ class Session:
         self._truth: dict[int, bytes] = {}
         self._odometry: dict[int, bytes] = {}
         self._path = b""
+        self._memory_mb: list[dict[str, float]] = []  # of each estimator, after half of the frames and after all
         self._image_times, self._path_times = StampTimes(), StampTimes()
 
     def run(self, show: Show, with_latency: bool = False) -> dict[str, Any]:
@@ -145,6 +147,7 @@ class Session:
             graph.start(config.simulator())
             graph.wait_for(lambda: bool(self._truth), "the first frame", START_TIMEOUT_S, recorder.spin_once)
             self._record(graph, recorder, show)
+            self._measure_memory(graph)
             if draws_map:
                 self._save_map(graph, recorder)
             graph.stop()
@@ -166,7 +169,14 @@ class Session:
                         for name in (self._config.world, "local_node", "ngo_node")
                     )
                 )
-            show("driving", len(self._path_times.received_ns) + 1)
+            frames = len(self._path_times.received_ns) + 1
+            if not self._memory_mb and frames >= self._config.frames // 2:
+                self._measure_memory(graph)
+            show("driving", frames)
+
+    def _measure_memory(self, graph: Graph) -> None:
+        names = [spec.executable for spec in self._config.estimators(self._out)]
+        self._memory_mb.append({name: round(memory_mb(graph.pid(name), "VmRSS"), 1) for name in names})
 
     def _save_map(self, graph: Graph, recorder: Recorder) -> None:
         client = recorder.node.create_client(SaveMap, "ngo_map/save_map")
@@ -184,6 +194,7 @@ class Session:
         except ValueError as error:
             raise GraphError(str(error)) from None
         result = evaluate(self._config.world, self._config.seed, trajectories)
+        result["memory_mb"] = {"half": self._memory_mb[0], "end": self._memory_mb[-1]}
         if with_latency:
             result["latency_ms"] = self._latency_ms()
         for name in ("truth", "odometry", "corrected"):

@@ -39,12 +39,14 @@ def test_ends_with_the_table_as_json(weights: Path, tmp_path: Path) -> None:
     done = run_demo("--weights", str(weights), "--out", str(tmp_path), "--latency")
     assert done.returncode == 0, done.stdout + done.stderr
     result = json.loads(done.stdout.splitlines()[-1])
-    latency = result.pop("latency_ms")
+    latency, memory = result.pop("latency_ms"), result.pop("memory_mb")
     assert list(result) == ["world", "seed", "frames", "path_m", "odometry", "corrected"]
     assert (result["world"], result["seed"], result["frames"]) == ("maze2d", 2000, FRAMES)
     assert list(result["odometry"]) == list(result["corrected"]) == ERRORS
     assert result["corrected"] == pytest.approx(result["odometry"], abs=1e-3)
     assert result["path_m"] > 1.0
+    assert {"local_node", "ngo_node"} <= memory["half"].keys() == memory["end"].keys()
+    assert all(50.0 < size < 1000.0 for sizes in memory.values() for size in sizes.values())
     assert 0.0 < latency["median"] <= latency["p99"] <= latency["max"] and latency["frames"] == FRAMES - 1
     assert (tmp_path / "picture.png").stat().st_size > 10_000
     with (tmp_path / "recording.mcap").open("rb") as stream:
