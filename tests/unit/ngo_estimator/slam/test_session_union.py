@@ -78,7 +78,7 @@ def test_too_few_or_empty_sessions_are_refused() -> None:
             united(wrong)
 
 
-def test_the_command_writes_a_state_that_can_be_loaded(tmp_path: Path) -> None:
+def test_the_command_writes_a_state_that_can_be_loaded_and_the_same_bytes_again(tmp_path: Path) -> None:
     blank = Session("scan", driven(()), MapOrigin.of_first_pose(np.zeros(3)), SmoothedCorrection(0.0))
     folders = []
     for name in ("first", "abroad", "back"):
@@ -90,6 +90,10 @@ def test_the_command_writes_a_state_that_can_be_loaded(tmp_path: Path) -> None:
     assert join_sessions.run(Arguments(tuple(folders), out, WEIGHTS / "scan"), console) == [tmp_path / "abroad"]
     assert "abroad is left out" in console.export_text()
     assert blank.loaded(out).core.newest().frames == len(FIRST) + len(BACK)
+    again = tmp_path / "again"
+    join_sessions.run(Arguments(tuple(folders), again, WEIGHTS / "scan"), console)
+    written = [{path.name: path.read_bytes() for path in folder.iterdir()} for folder in (out, again)]
+    assert written[0] == written[1]
     with pytest.raises(ValueError, match="is there already"):
         join_sessions.run(Arguments(tuple(folders), out), console)
     with pytest.raises(ValueError, match="nothing was written"):
