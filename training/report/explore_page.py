@@ -37,7 +37,8 @@ smallest frontier, pace and blacklist. Intervals are of 95 %, by resampling plac
 
 Coverage counts the free cells that exact rays see from all places where the robot can go; what a robot has seen is
 entered at its true poses. The ratio is the geometric
-mean over the places where both rules came to 95 %. The tour on the known map is searched for (insertion, 2-opt, or-opt,
+mean over the places where both rules came to 95 %; a mean path is over those where its own rule did, so that a
+rule which gives long places up has a short one. The tour on the known map is searched for (insertion, 2-opt, or-opt,
 large neighbourhoods); the shortest one may be a little shorter.
 IoU is the mean of free and occupied cells of the robot's own map beside those exact rays, a map of
 own poses aligned as for the ATE; at true poses it is that of

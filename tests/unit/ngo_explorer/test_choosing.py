@@ -144,7 +144,7 @@ def test_a_tour_by_worth_goes_to_the_large_room_before_the_near_nook() -> None:
     order, length = tour(np.abs(places), between)
     assert order.tolist() == [0, 1, 2] and length == pytest.approx(6.0)
     order, cost = tour(np.abs(places), between, worth=np.array((0.5, 20.0, 20.0)))
-    assert order.tolist() == [1, 2, 0] and cost == pytest.approx(20.0 * 3.0 + 20.0 * 4.0 + 0.5 * 9.0)
+    assert order.tolist() == [1, 2, 0] and cost == pytest.approx(20.0 * 3.0 + 20.0 * 4.0 + 0.5 * 9.0 + 0.3 * 9.0 * 40.5)
 
 
 def test_a_given_first_place_stays_first() -> None:

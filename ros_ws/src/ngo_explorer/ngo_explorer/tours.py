@@ -10,13 +10,15 @@ from ngo_explorer.known_map import Floats
 
 Ints = NDArray[np.int64]
 
+_WHOLE = 0.3  # of the whole length by all worth, in what a tour costs: small places are not left for the end
+
 
 def tour(first_m: Floats, between_m: Floats, start: int = -1, worth: Floats | None = None) -> tuple[Ints, float]:
     """The order ``(n,)`` in which to visit n places, and what it costs: its length in m.
 
     With ``worth`` ``(n,)`` of the places, not all 0, the cost is the sum of the ways until each of them by its worth,
-    as of a travelling repairman. first_m: ``(n,)`` ways from the robot. between_m: ``(n, n)`` ways between the places.
-    start: the place to visit first; -1: any.
+    as of a travelling repairman, and 0.3 of the whole length by all of the worth. first_m: ``(n,)`` ways from the
+    robot. between_m: ``(n, n)`` ways between the places. start: the place to visit first; -1: any.
     """
     order = _inserted(first_m, between_m, start)
     worth = np.zeros(len(first_m)) if worth is None else worth
@@ -62,7 +64,7 @@ def _cost(order: Ints, first: Floats, between: Floats, worth: Floats) -> float:
     for index in range(1, len(order)):
         way += between[order[index - 1], order[index]]
         total += way * worth[order[index]]
-    return total if worth.any() else way
+    return total + _WHOLE * way * worth.sum() if worth.any() else way
 
 
 @njit(cache=True)
