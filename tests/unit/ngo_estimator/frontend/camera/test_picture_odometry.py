@@ -95,16 +95,12 @@ def test_a_clock_that_is_wrong_is_told_by_the_stamps() -> None:
         assert odometry.clocks == f"newest stamp of pictures {109.9 + ahead_s:.3f} s, of odometry {newest}"
 
 
-def test_a_texture_that_repeats_leaves_the_turn_as_open_as_the_wheels_do() -> None:
+def test_a_pose_far_from_the_wheels_counts_where_far_more_corners_agree() -> None:
     def view(yaw: float, agree: int) -> ViewPose:
         return ViewPose(np.array((0.1, 0.0, yaw)), np.diag((1e-6, 1e-6, 1e-6)), np.arange(100) < agree)
 
-    given = np.diag((1e-2, 1e-2, 0.02**2))
-    assert _likelier(view(0.0, 40), view(0.07, 60), given).pose[2] == 0.0
-    assert _likelier(view(0.0, 10), view(0.07, 60), given).pose[2] == 0.07
-    for far_rad, least_rad, most_rad in ((0.07, 0.018, 0.0201), (0.01, 0.007, 0.008)):
-        covariance = _likelier(view(0.0, 40), view(far_rad, 60), given).covariance
-        assert least_rad < math.sqrt(covariance[2, 2]) < most_rad
+    assert _likelier(view(0.0, 40), view(0.07, 60)).pose[2] == 0.0
+    assert _likelier(view(0.0, 10), view(0.07, 60)).pose[2] == 0.07
 
 
 def test_corners_of_stripes_are_found_only_where_they_are_expected() -> None:

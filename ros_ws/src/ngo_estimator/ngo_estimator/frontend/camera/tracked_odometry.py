@@ -179,7 +179,7 @@ class TrackedOdometry:
         if fitted.inlier.mean() < _AGREEING:
             other = self._without_prior(seen, mean)
             if other is not None:
-                fitted = _likelier(fitted, fit(other, information), covariance)
+                fitted = _likelier(fitted, fit(other, information))
         off = np.append(fitted.pose[:2] - mean[:2], wrap(fitted.pose[2] - mean[2]))
         if off[:2] @ information[:2, :2] @ off[:2] > _MOST_SURPRISE**2:
             # Few near points may tell any way: then the given one counts, and pictures tell the heading alone.
@@ -278,18 +278,9 @@ def _turn(yaw: float) -> Array:
     return np.array(((cos, -sin, 0.0), (sin, cos, 0.0), (0.0, 0.0, 1.0)))
 
 
-def _likelier(near: ViewPose, far: ViewPose, given: Array) -> ViewPose:
-    """Of two poses that corners may mean the one near the given motion, unless far more agree with the other.
-
-    Textures that repeat look the same again after a turn: what speaks for the other pose is left open, but for what the
-    covariance ``(3, 3)`` of the given motion excludes.
-    """
-    agree = int(near.inlier.sum()), int(far.inlier.sum())
-    if agree[1] > _FAR_MORE * agree[0]:
-        return far
-    off = np.append(far.pose[:2] - near.pose[:2], wrap(far.pose[2] - near.pose[2]))
-    covariance = near.covariance + agree[1] / max(1, sum(agree)) * np.outer(off, off)
-    return replace(near, covariance=_surer(covariance, given))
+def _likelier(near: ViewPose, far: ViewPose) -> ViewPose:
+    """Of two poses that corners may mean the one near the given motion, unless far more agree with the other."""
+    return far if far.inlier.sum() > _FAR_MORE * near.inlier.sum() else near
 
 
 def _surer(one: Array, other: Array) -> Array:
