@@ -21,8 +21,8 @@ last solution, and `changed` is the share of its verdicts about known loops that
 each block. `hard_` graphs have a poor odometry, and twice as many loops as `synthetic_` ones. A loop counts as
 believed where the poses fit it within its stated threshold. `cheapest` is the share of graphs where the truncated cost
 of what was found is not above that of the right loops' solution. A graph that is not solved there has a cheaper wrong
-solution: no search for a lower cost would find the right one. There is no row `learned`: three designs won nowhere
-([notebook](notebook.md#pose-graphs-with-wrong-loops)).
+solution: no search for a lower cost would find the right one. There is no row `learned`: the one design of four
+that solves more takes twice the time ([notebook](notebook.md#pose-graphs-with-wrong-loops)).
 
 | kind | wrong loops |
 |---|---|

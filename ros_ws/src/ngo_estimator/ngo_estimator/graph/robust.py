@@ -1,7 +1,7 @@
 """The robust corrector: no network, and right with most loops wrong.
 
 Two methods give a solution: graduated non-convexity over all loops that the cycles do not rule out, and belief in the
-surest loops first. Where one factor does not hold all of these, graduated non-convexity tries two choices of them. What
+surest loops first. Where one factor does not hold all places, graduated non-convexity tries two choices of them. What
 each solution predicts lets more loops in. One cost judges between all. Covariances that are not as stated are scaled.
 Cycles of loops that know the whole relative pose measure the scale before anything is solved, and the residuals of
 what is believed measure it afterwards.
@@ -112,13 +112,16 @@ def _from_nothing(problem: GraphProblem, told: Told, least_scale: float) -> Corr
         scale = _noticed(scale, least_scale)
         scaled = problem.scaled(scale)
     odds = cycle_odds(ChainUncertainty(scaled.steps), scaled.loops, area, inlier_ratio)
-    begun, solutions = replace(scaled, poses=chain), []
-    for cell in _CELLS:
-        rows = _spread(scaled.loops.nodes, odds, cell)[: np.count_nonzero(odds > 0.0)]
-        likely, structure = _affordable(begun, rows)
+    begun, solutions, count = replace(scaled, poses=chain), [], np.count_nonzero(odds > 0.0)
+    # Of whole relative poses the likeliest are right; of places they are where the chain is short.
+    orders = [np.argsort(-odds, kind="stable")]
+    if not metric.any():
+        orders = [_spread(scaled.loops.nodes, odds, cell) for cell in _CELLS]
+    for order in orders:
+        likely, structure = _affordable(begun, order[:count])
         solutions.append(graduate(likely, chain, told=told, structure=structure)[0])
-        if len(likely.loops) == len(rows):
-            nothing = np.zeros(len(rows), bool)
+        if len(likely.loops) == count or metric.any():
+            nothing = np.zeros(len(likely.loops), bool)
             solutions.append(believe(likely, chain, nothing, area, inlier_ratio, told, structure)[0])
             break
     different = {scaled.fits(poses).tobytes(): poses for poses in solutions}  # what believes the same ends at the same
@@ -126,7 +129,7 @@ def _from_nothing(problem: GraphProblem, told: Told, least_scale: float) -> Corr
     best = min(solutions, key=lambda poses: truncated_cost(scaled, poses))
     fits, let_in = scaled.fits(best)[~metric], odds[~metric] > 0.0
     if not metric.all() and (fits & let_in).sum() <= _AGREE * (fits | let_in).sum():
-        everything, structure = _affordable(begun, _spread(scaled.loops.nodes, odds, _CELLS[0]))
+        everything, structure = _affordable(begun, orders[0])
         poses = graduate(everything, chain, told=told, structure=structure)[0]
         best = min(best, poses, key=lambda poses: truncated_cost(scaled, poses))
     solution = _polished(problem, best, scale, len(problem.loops), least_scale)
