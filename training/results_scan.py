@@ -77,7 +77,7 @@ class Arguments(Folders):
     frames: int = 2000  # Scans in a maze.
     rows: tuple[str, ...] = ()  # Rows to measure, by name; none: all.
     tables: tuple[Literal["logs", "buildings", "aliased", "slip", "maze2d", "scanners"], ...] = ()
-    """Tables to measure; none: all. The others hold what earlier runs measured."""
+    """Tables to measure; none: all. The others hold what earlier runs measured, or what is published."""
     known: bool = False
     """Measure nothing: the tables hold what earlier runs of this command measured, and say of how many drives."""
     weights: Path = records.WEIGHTS / "scan"  # Folder with lidar.json, the settings of our estimators.
@@ -122,9 +122,24 @@ def main(arguments: Arguments) -> dict[str, Any]:
         "skipped": skipped,
         "failed": _failures({"logs": logs, **tables, **scanners}),
     }
+    _keep_published(result, arguments.published("scan"))
     images = lidar_figures.draw(arguments.images, logs, tables)
     _print(found, skipped)
     return arguments.publish("scan", result, lidar_page.page(result, images))
+
+
+def _keep_published(result: dict[str, Any], published: Mapping[str, Any]) -> None:
+    """Take over the tables that are published and not measured anew; ``revisions`` names that of each of them."""
+    earlier, revisions = published.get("revisions", {}), {}
+    places = {**dict.fromkeys(result["tables"], "tables"), **dict.fromkeys(result["scanners"], "scanners")}
+    for name, place in places.items():
+        old = {row: cell for row, cell in published.get(place, {}).get(name, {}).items() if row in ROWS}
+        if old and not result[place][name]:
+            result[place][name] = old
+            paired = published["paired"].get(name, {})
+            result["paired"][name] = {row: cell for row, cell in paired.items() if row in ROWS}
+            revisions[name] = earlier.get(name, published["revision"])
+    result["revisions"] = revisions
 
 
 def _command(recorded: str, with_logs: bool) -> str:

@@ -74,7 +74,9 @@ def test_results_of_two_tiny_buildings(tmp_path: Path, monkeypatch: pytest.Monke
 
     shifted = results_scan.main(replace(arguments, known=True, first_building=1))
     assert shifted["settings"]["first_building"] == 1
-    assert shifted["tables"]["buildings"] == {}
+    assert shifted["tables"]["buildings"] == known["tables"]["buildings"]  # what is published stays, and says so
+    assert shifted["revisions"] == {"buildings": known["revision"]}
+    assert "of an earlier revision: buildings" in (tmp_path / "docs" / "results_scan.md").read_text()
     assert shifted["tables"]["aliased"]["ours"]["ate_m"]["drives"] == 1
 
 

@@ -34,7 +34,7 @@ def page(result: Mapping[str, Any], images: Mapping[str, str]) -> str:
         "relations of a log, over the drives of a table. A number of one whole log has none. Odometry is what the "
         "correction was given: our front end's. Online is each pose as it was published. Speed is by computing time on "
         "one thread. Numbers in full are in [`training/results/scan.json`](../training/results/scan.json).",
-        *([f"**{result['note']}**"] if "note" in result else []),
+        *_earlier(result.get("revisions", {})),
         "## Bars",
         _bars(result["bars"]),
     ]
@@ -78,6 +78,11 @@ def page(result: Mapping[str, Any], images: Mapping[str, str]) -> str:
         if lines:
             parts += [f"## {title}", "\n".join(f"- {line}" for line in lines)]
     return whole(parts)
+
+
+def _earlier(revisions: Mapping[str, str]) -> list[str]:
+    names = [f"{name} (`{revision}`)" for name, revision in revisions.items()]
+    return [f"**Not measured anew, and so of an earlier revision: {', '.join(names)}.**"] if names else []
 
 
 def _ablation(result: Mapping[str, Any]) -> list[str]:
