@@ -75,7 +75,7 @@ class Arguments(Folders):
     ablation: int = 5  # How many of these get the rows of the ablation; and how many buildings have slipping wheels.
     mazes: int = 8  # Mazes of each scanner; 8 for the comparison with the networks of version 0.1.0.
     frames: int = 2000  # Scans in a maze.
-    rows: tuple[str, ...] = ()  # Rows to measure, by name; none: all.
+    rows: tuple[str, ...] = ()  # Rows to measure, by name; none: all. Tables that are measured hold these alone.
     tables: tuple[Literal["logs", "buildings", "aliased", "slip", "maze2d", "scanners"], ...] = ()
     """Tables to measure; none: all. The others hold what earlier runs measured, or what is published."""
     known: bool = False
@@ -123,23 +123,37 @@ def main(arguments: Arguments) -> dict[str, Any]:
         "failed": _failures({"logs": logs, **tables, **scanners}),
     }
     _keep_published(result, arguments.published("scan"))
-    images = lidar_figures.draw(arguments.images, logs, tables)
+    images = lidar_figures.draw(arguments.images, logs, tables, result["earlier"])
     _print(found, skipped)
     return arguments.publish("scan", result, lidar_page.page(result, images))
 
 
 def _keep_published(result: dict[str, Any], published: Mapping[str, Any]) -> None:
-    """Take over the tables that are published and not measured anew; ``revisions`` names that of each of them."""
-    earlier, revisions = published.get("revisions", {}), {}
+    """Take over the tables that are published and not measured anew, with their bars and failures.
+
+    ``earlier`` of the result names the revision and the settings of each of them.
+    """
+    result["earlier"], measured = {}, list[str]()
     places = {**dict.fromkeys(result["tables"], "tables"), **dict.fromkeys(result["scanners"], "scanners")}
-    for name, place in places.items():
-        old = {row: cell for row, cell in published.get(place, {}).get(name, {}).items() if row in ROWS}
-        if old and not result[place][name]:
-            result[place][name] = old
-            paired = published["paired"].get(name, {})
-            result["paired"][name] = {row: cell for row, cell in paired.items() if row in ROWS}
-            revisions[name] = earlier.get(name, published["revision"])
-    result["revisions"] = revisions
+    for name in ("logs", *places):
+        new: dict[str, Any] = result[places[name]] if name in places else result
+        old = published.get(places[name], {}) if name in places else published
+        if new[name]:
+            measured += [name, *(result["logs"] if name == "logs" else ())]
+        elif old.get(name):
+            new[name] = old[name] if name == "logs" else _known(old[name])
+            result["paired"][name] = _known(published["paired"].get(name, {}))
+            of = {"revision": published["revision"], "settings": published["settings"]}
+            result["earlier"][name] = published.get("earlier", {}).get(name, of)
+    found = [bar["name"] for bar in result["bars"]]
+    for bar in published.get("bars", ()):
+        if bar["name"] not in found and not any(name in bar["name"] for name in measured):
+            result["bars"].append(bar)
+    result["failed"] += [line for line in published.get("failed", ()) if line.partition(",")[0] in result["earlier"]]
+
+
+def _known(rows: Mapping[str, Any]) -> dict[str, Any]:
+    return {row: cell for row, cell in rows.items() if row in ROWS}
 
 
 def _command(recorded: str, with_logs: bool) -> str:

@@ -33,6 +33,7 @@ from training.scoring.table import Measured, measure
 
 _FIRST_BUILDINGS = {"validation": 12_000, "test": 22_000}
 STRESS_ROWS = ("wheels", "ours", "ours_without_wheels", "kiss_icp")
+_ROWS = (*STRESS_ROWS, *FRONT_ABLATION)
 
 
 @dataclass(frozen=True)
@@ -67,7 +68,7 @@ class Arguments(Folders):
     def __post_init__(self) -> None:
         for name, given, known in (
             ("changes", self.changes, (*CHANGES,)),
-            ("rows", self.rows, (*STRESS_ROWS, *FRONT_ABLATION)),
+            ("rows", self.rows, _ROWS),
         ):
             if unknown := [one for one in given if one not in known]:
                 raise ValueError(f"{name} has {', '.join(unknown)}; expected among {', '.join(known)}")
@@ -83,13 +84,14 @@ class Arguments(Folders):
 def main(arguments: Arguments) -> dict[str, Any]:
     """Measure, print each number, write everything, and return the JSON's content."""
     record = records.record("results", arguments)
-    rows = [name for name in (*STRESS_ROWS, *FRONT_ABLATION) if name not in ROWS or not ROWS[name].missing()]
+    rows = [name for name in _ROWS if name not in ROWS or not ROWS[name].missing()]
     asked = [name for name in rows if name in (arguments.rows or STRESS_ROWS)]
     logs = {} if arguments.logs is None else _logs(arguments, rows, asked)
     tables = {name: _simulated(arguments, name, table, asked) for name, table in _tables(arguments).items()}
     if earlier := arguments.published("stress"):
         logs = with_earlier(logs, earlier["logs"], earlier["revision"])
-        tables = with_earlier(tables, earlier["tables"], earlier["revision"])
+        if earlier["settings"] == {name: getattr(arguments, name) for name in earlier["settings"]}:
+            tables = with_earlier(tables, earlier["tables"], earlier["revision"])
     result = {
         "command": 'make results WORLD=stress ARGS="--logs FOLDER"',
         "revision": record["revision"],
@@ -108,7 +110,7 @@ def with_earlier(tables: Mapping[str, Any], published: Mapping[str, Any], revisi
     for table in dict.fromkeys((*tables, *published)):
         old, new = published.get(table, {}), tables.get(table, {})
         result[table] = {
-            change: {row: {"revision": revision, **cell} for row, cell in old.get(change, {}).items()}
+            change: {row: {"revision": revision, **old[change][row]} for row in old.get(change, {}) if row in _ROWS}
             | new.get(change, {})
             for change in dict.fromkeys((*CHANGES, *old, *new))
             if change in old or change in new

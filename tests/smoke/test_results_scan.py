@@ -75,8 +75,11 @@ def test_results_of_two_tiny_buildings(tmp_path: Path, monkeypatch: pytest.Monke
     shifted = results_scan.main(replace(arguments, known=True, first_building=1))
     assert shifted["settings"]["first_building"] == 1
     assert shifted["tables"]["buildings"] == known["tables"]["buildings"]  # what is published stays, and says so
-    assert shifted["revisions"] == {"buildings": known["revision"]}
-    assert "of an earlier revision: buildings" in (tmp_path / "docs" / "results_scan.md").read_text()
+    assert shifted["earlier"]["buildings"] == {"revision": known["revision"], "settings": known["settings"]}
+    kept = [bar for bar in known["bars"] if bar["name"].endswith("buildings")]
+    assert kept and all(bar in shifted["bars"] for bar in kept)
+    page = (tmp_path / "docs" / "results_scan.md").read_text()
+    assert "of an earlier revision: buildings" in page and "results_scan_buildings.png" in page
     assert shifted["tables"]["aliased"]["ours"]["ate_m"]["drives"] == 1
 
 

@@ -1,6 +1,6 @@
 """Pictures of a lidar's results: trajectories, and all scans at corrected poses."""
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -17,10 +17,10 @@ _DRAWN = {"buildings": 4, "aliased": 2}
 _COLOURS = "Key scans at corrected poses (grey), corrected path (blue), wheels where they stay in the picture (red)"
 
 
-def draw(folder: Path, logs: Drives, tables: Mapping[str, Drives]) -> dict[str, str]:
+def draw(folder: Path, logs: Drives, tables: Mapping[str, Drives], earlier: Collection[str] = ()) -> dict[str, str]:
     """Draw logs and the first buildings of each table into ``folder``; returns the files' names with their captions.
 
-    A log with relations has a picture of its own; all others share one.
+    A log with relations has a picture of its own; all others share one. Tables that are ``earlier`` ones keep theirs.
     """
     with_relations = {name: rows for name, rows in _drawable(logs).items() if "translation_m" in rows["ours"].errors}
     pictures = {f"log_{name}": ({name: rows}, name) for name, rows in with_relations.items()}
@@ -31,8 +31,10 @@ def draw(folder: Path, logs: Drives, tables: Mapping[str, Drives]) -> dict[str, 
         pictures[table] = dict(first), f"the first drives of the table `{table}`, truth in black"
     images: dict[str, str] = {}
     for name, (drives, what) in pictures.items():
+        path = folder / f"results_scan_{name}.png"
         if drives:
-            _draw(folder / f"results_scan_{name}.png", drives)
+            _draw(path, drives)
+        if drives or (name in earlier and path.is_file()):
             images[f"results_scan_{name}.png"] = f"{_COLOURS}: {what}."
     return images
 

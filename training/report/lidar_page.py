@@ -34,7 +34,7 @@ def page(result: Mapping[str, Any], images: Mapping[str, str]) -> str:
         "relations of a log, over the drives of a table. A number of one whole log has none. Odometry is what the "
         "correction was given: our front end's. Online is each pose as it was published. Speed is by computing time on "
         "one thread. Numbers in full are in [`training/results/scan.json`](../training/results/scan.json).",
-        *_earlier(result.get("revisions", {})),
+        *_earlier(result["earlier"]),
         "## Bars",
         _bars(result["bars"]),
     ]
@@ -80,8 +80,8 @@ def page(result: Mapping[str, Any], images: Mapping[str, str]) -> str:
     return whole(parts)
 
 
-def _earlier(revisions: Mapping[str, str]) -> list[str]:
-    names = [f"{name} (`{revision}`)" for name, revision in revisions.items()]
+def _earlier(tables: Mapping[str, Any]) -> list[str]:
+    names = [f"{name} (`{of['revision']}`)" for name, of in tables.items()]
     return [f"**Not measured anew, and so of an earlier revision: {', '.join(names)}.**"] if names else []
 
 

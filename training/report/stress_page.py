@@ -30,7 +30,9 @@ def page(result: dict[str, Any]) -> str:
     """The page of a JSON's content."""
     parts = [_INTRODUCTION.format(**result)]
     parts += [f"## {log}\n\n{_table(table)}" for log, table in result["logs"].items()]
-    parts += [_ABLATION, *(f"### {log}\n\n{_ablation(table)}" for log, table in result["logs"].items())]
+    ablated = {log: text for log, table in result["logs"].items() if (text := _ablation(table))}
+    if ablated:
+        parts += [_ABLATION, *(f"### {log}\n\n{text}" for log, text in ablated.items())]
     if result["bars"]:
         parts.append("## Bars\n\n" + _bars(result["bars"]))
     parts += [_simulated(name, table) for name, table in result["tables"].items() if table]

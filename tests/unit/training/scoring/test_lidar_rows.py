@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from scipy.stats import multivariate_normal
 
+from ngo_estimator.frontend.lidar.mixture_config import MixtureConfig
 from ngo_estimator.geometry.scan_points import Mounting
 from ngo_estimator.graph.relative_poses import RelativePoses
 from ngo_recordings.scan_stream import LidarScan, WheelPose
@@ -15,7 +16,7 @@ from training.baselines.lidar_peers import GraphPeerConfig, solve_lm
 from training.data.lidar_drives import LidarDrive, ReferencePoses, Relations, TruePoses
 from training.scoring.lidar_bars import Bar, bars
 from training.scoring.lidar_errors import absolute_error_m, covariance_errors, lidar_errors
-from training.scoring.lidar_rows import ROWS, DriveRuns, Estimate, Row, changed, identity_of
+from training.scoring.lidar_rows import FRONT_ABLATION, ROWS, DriveRuns, Estimate, Row, changed, identity_of
 from training.scoring.lidar_scores import scored, scored_rows
 from training.scoring.table import Measured
 from training.scoring.wrong_loops import solve_ours, with_wrong_loops
@@ -223,3 +224,9 @@ def test_our_corrector_withstands_wrong_loops_and_least_squares_do_not(percent: 
     config = GraphPeerConfig(cauchy=1e6)
     assert np.abs(solve_ours(STEPS, fed, start, config) - TRUTH).max() < 0.05
     assert np.abs(solve_lm(STEPS, fed, start, config) - TRUTH).max() > 1.0
+
+
+@pytest.mark.parametrize("row", FRONT_ABLATION)
+def test_each_row_of_the_ablation_leaves_something_out(row: str) -> None:
+    config = MixtureConfig()
+    assert changed(config, FRONT_ABLATION[row].settings.odometry) != config
