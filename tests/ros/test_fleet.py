@@ -70,7 +70,7 @@ def check_graph_of(probe: Probe, core: Fleet, path: Path) -> None:
     assert not probe.call(RemoveLoop, "ngo_node/remove_loop", request).success
     ids = {"first_id": 0, "second_id": int(graph.ids[-1])}
     answer = probe.call(RemoveLoop, "ngo_node/remove_loop", RemoveLoop.Request(what=RemoveLoop.Request.STRETCH, **ids))
-    assert "in another's" in answer.message
+    assert "ends in another" in answer.message
 
 
 def test_robots_that_meet_are_in_one_map_frame_and_on_one_map_until_a_reset(tmp_path: Path) -> None:

@@ -7,6 +7,7 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
+import numpy as np
 from ngo_msgs.srv import LoadState, SaveGraph, SaveState, SaveTrajectory
 from rclpy.callback_groups import MutuallyExclusiveCallbackGroup
 from rclpy.node import Node
@@ -29,13 +30,17 @@ if TYPE_CHECKING:
     Trajectories = Mapping[str, Trajectory]
 
 Result = TypeVar("Result")
+Written = tuple[np.ndarray, np.ndarray | None]
 
 
 class FileServices:
     """Answers ``~/save_trajectory`` and ``~/save_graph``.
 
-    Files are written in a thread, while relative poses go on.
+    Files are written in a thread, while relative poses go on. ``written`` is what the ids of the graph that was written
+    last name: the stamps of its poses, and the ranks of their drives where there are several.
     """
+
+    written: "Written | None" = None
 
     def __init__(
         self,
@@ -71,12 +76,19 @@ class FileServices:
         graph = self._graph() if request.path.endswith(GRAPH_ENDING) else None
         write = partial(_write, trajectories=trajectories, graph=graph)
         response.success, response.message = await self._aside(lambda: _written(request.path, folder, write))
+        self._keep_names(response.success, graph)
         return response
 
     async def _on_save_graph(self, request: SaveGraph.Request, response: SaveGraph.Response) -> SaveGraph.Response:
-        write = partial(_write_graph, trajectories=self._trajectories(), graph=self._graph())
+        graph = self._graph()
+        write = partial(_write_graph, trajectories=self._trajectories(), graph=graph)
         response.success, response.message = await self._aside(lambda: _written(request.path, self._folder, write))
+        self._keep_names(response.success, graph)
         return response
+
+    def _keep_names(self, success: bool, graph: "PlanarGraph | None") -> None:
+        if success and graph is not None:
+            self.written = graph.stamps_ns, graph.ranks
 
     async def _aside(self, work: Callable[[], Result]) -> Result:
         """The result of work that is done in a thread, or its error."""

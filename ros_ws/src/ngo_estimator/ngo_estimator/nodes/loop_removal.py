@@ -11,17 +11,25 @@ from ngo_estimator.nodes.messages import to_ns
 if TYPE_CHECKING:  # brings torch, which takes seconds: nodes import it after checking their parameters
     from rclpy.impl.rcutils_logger import RcutilsLogger
 
+    from ngo_estimator.nodes.file_services import Written
     from ngo_estimator.slam.corrected_trajectory import CorrectedTrajectory
 
 _NS = 1e-9
 
 
 def remove_loops(
-    core: "CorrectedTrajectory", request: RemoveLoop.Request, response: RemoveLoop.Response, logger: "RcutilsLogger"
+    core: "CorrectedTrajectory",
+    written: "Written | None",
+    request: RemoveLoop.Request,
+    response: RemoveLoop.Response,
+    logger: "RcutilsLogger",
 ) -> bool:
-    """Take out what a request names, and answer; returns whether loops are out."""
+    """Take out what a request names, and answer; returns whether loops are out.
+
+    ``written``: what ids name; see ``FileServices``.
+    """
     try:
-        response.message, response.success = _removed(core, request), True
+        response.message, response.success = _removed(core, written, request), True
     except ValueError as error:
         response.message = str(error)
         return False
@@ -29,7 +37,7 @@ def remove_loops(
     return True
 
 
-def _removed(core: "CorrectedTrajectory", request: RemoveLoop.Request) -> str:
+def _removed(core: "CorrectedTrajectory", written: "Written | None", request: RemoveLoop.Request) -> str:
     """Take out what a request names; returns a message for the user, or raises ``ValueError`` with one."""
     graph, trajectory = core.planar_graph(), core.trajectory()
     if graph is None or trajectory is None:
@@ -37,22 +45,37 @@ def _removed(core: "CorrectedTrajectory", request: RemoveLoop.Request) -> str:
     if request.what not in (RemoveLoop.Request.LOOP, RemoveLoop.Request.STRETCH):
         raise ValueError(f"what is {request.what}; expected 0 (LOOP) or 1 (STRETCH)")
     named = ((request.first_id, request.first), (request.second_id, request.second))
-    first, second = (_frame(core.vertices, trajectory.stamps_ns, name, stamp) for name, stamp in named)
+    stamps_ns, ranks = trajectory.stamps_ns, core.ranks
+    first, second = (
+        _frame(stamps_ns, stamp) if name < 0 else _frame_of_vertex(stamps_ns, ranks, written, name)
+        for name, stamp in named
+    )
     stretch = request.what == RemoveLoop.Request.STRETCH
     removed = core.remove_loops(first, second, stretch)
     if removed == 0:
-        joined, stamps = graph.stamps_ns[graph.edges[graph.is_loop]], trajectory.stamps_ns[[first, second]]
+        joined, stamps = graph.stamps_ns[graph.edges[graph.is_loop]], stamps_ns[[first, second]]
         raise ValueError(f"no loop {'ends there' if stretch else 'joins these poses'}; {_nearest(joined, stamps)}")
     if core.fault:
         raise ValueError(f"{removed} loops are out, but {core.fault}")
     return f"{removed} loops are out; {int(graph.is_loop.sum()) - removed} stay"
 
 
-def _frame(vertices: np.ndarray, stamps_ns: np.ndarray, name: int, stamp: Time) -> int:
-    if name >= 0:
-        if name >= len(vertices):
-            raise ValueError(f"there is no vertex {name}; expected 0 to {len(vertices) - 1}")
-        return int(vertices[name])
+def _frame_of_vertex(stamps_ns: np.ndarray, ranks: np.ndarray, written: "Written | None", name: int) -> int:
+    """The frame of a vertex as it was written: since then others may have come before it, or nodes be gone."""
+    if written is None:
+        raise ValueError("ids are those of a saved graph; expected save_graph before, or stamps")
+    of_vertices, drives = written
+    if name >= len(of_vertices):
+        raise ValueError(f"there is no vertex {name}; expected 0 to {len(of_vertices) - 1}")
+    there = stamps_ns == of_vertices[name]
+    if drives is not None:
+        there &= ranks == drives[name]
+    if not there.any():
+        raise ValueError(f"the pose of vertex {name} is gone; expected those of a graph that is saved now")
+    return int(there.argmax())
+
+
+def _frame(stamps_ns: np.ndarray, stamp: Time) -> int:
     given = to_ns(stamp)
     frames = np.flatnonzero(stamps_ns == given)
     if len(frames) == 0:

@@ -360,7 +360,7 @@ class NgoNode(ManagedNode):
     def _on_remove_loop(self, request: RemoveLoop.Request, response: RemoveLoop.Response) -> RemoveLoop.Response:
         if self._search is not None:
             response.message = "the robot is looked for in the map, which stays as it is; no loop was taken out"
-        elif remove_loops(self._core, request, response, self.get_logger()):
+        elif remove_loops(self._core, self._files.written, request, response, self.get_logger()):
             self._on_correction(self._core.newest())
             if self._inputs:
                 self._pending.reset()

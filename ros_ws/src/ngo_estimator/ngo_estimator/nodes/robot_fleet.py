@@ -90,7 +90,8 @@ class RobotFleet:
             built.callback(self._status.close)
             self._robots = {name: _Robot(self, name, built) for name in settings.robots}
         self._status.idle = "inactive"
-        FileServices(node, settings, self._trajectories, self._graph).open(_SERVICES, built)
+        self._files = FileServices(node, settings, self._trajectories, self._graph)
+        self._files.open(_SERVICES, built)
         for kind, name, callback in (
             (Reset, "~/reset", self._on_reset),
             (SetBool, "~/pause", self._on_pause),
@@ -156,7 +157,8 @@ class RobotFleet:
         return graph and replace(graph, poses=self._origin.poses(graph.poses))
 
     def _on_remove_loop(self, request: RemoveLoop.Request, response: RemoveLoop.Response) -> RemoveLoop.Response:
-        if remove_loops(self._fleet.core, request, response, self.node.get_logger()):
+        written, log = self._files.written, self.node.get_logger()
+        if remove_loops(self._fleet.core, written, request, response, log):
             self._on_correction()
             if self._inputs:
                 self._pending.reset()

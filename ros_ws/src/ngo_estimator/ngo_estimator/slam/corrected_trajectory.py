@@ -243,12 +243,11 @@ class CorrectedTrajectory(ABC):
             first, second: the frames; with ``stretch`` the first and the last one of the stretch.
 
         Raises:
-            ValueError: a stretch is to end in the drive of another robot.
+            ValueError: a stretch is to end in another drive.
         """
         low, high = min(first, second), max(first, second)
-        ranks = self._back_end.graph.rank_of_frames
-        if stretch and ranks[low] != ranks[high]:
-            raise ValueError("the stretch begins in one robot's drive and ends in another's; expected a single one")
+        if stretch and self.ranks[low] != self.ranks[high]:
+            raise ValueError("the stretch begins in one drive and ends in another; expected a single one")
 
         def which(frames: np.ndarray) -> np.ndarray:
             within = ((frames >= low) & (frames <= high)).any(axis=1)
@@ -262,9 +261,9 @@ class CorrectedTrajectory(ABC):
         return removed
 
     @property
-    def vertices(self) -> np.ndarray:
-        """The frames ``(n,)`` that are the vertices of ``planar_graph``."""
-        return np.arange(self._log.steps + 1)
+    def ranks(self) -> np.ndarray:
+        """The rank of each frame's drive ``(frames,)``, by which it is named."""
+        return self._back_end.graph.rank_of_frames
 
     def planar_graph(self) -> PlanarGraph | None:
         """The graph as it is now, with the belief in its loops, or None before the first step."""

@@ -3,8 +3,6 @@
 from dataclasses import asdict
 from typing import Any
 
-import numpy as np
-
 from ngo_estimator.geometry.key_picture import LAYOUT
 from ngo_estimator.loops.picture_settings import PictureGraphConfig
 from ngo_estimator.slam.corrected_trajectory import CorrectedTrajectory
@@ -27,17 +25,12 @@ class PictureTrajectory(CorrectedTrajectory):
         self._config = config or PictureGraphConfig()
         super().__init__(answers_first=iterations_per_step > 0)
 
-    @property
-    def vertices(self) -> np.ndarray:
-        """See ``CorrectedTrajectory.vertices``."""
-        return self._back_end.graph.frames.nodes
-
     def planar_graph(self) -> PlanarGraph | None:
         """The graph of key pictures as it is now; see ``CorrectedTrajectory.planar_graph``."""
         if self._log.steps == 0:
             return None
         back_end, graph = self._back_end, self._back_end.graph
-        stamps_ns = self._log.stamps_ns.values[self.vertices]
+        stamps_ns = self._log.stamps_ns.values[graph.frames.nodes]
         return graph_of(stamps_ns, graph.poses.copy(), *back_end.measurements(), back_end.belief())
 
     @property

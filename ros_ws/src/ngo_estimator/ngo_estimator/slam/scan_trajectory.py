@@ -107,18 +107,14 @@ class ScanTrajectory(CorrectedTrajectory):
         """Points ``(n, 2)`` of all key scans at their corrected poses, thinned to about ``most``."""
         return self._back_end.walls(most)
 
-    @property
-    def vertices(self) -> np.ndarray:
-        """See ``CorrectedTrajectory.vertices``."""
-        return self._back_end.graph.frames.nodes
-
     def planar_graph(self) -> PlanarGraph | None:
         """The graph of key scans as it is now; see ``CorrectedTrajectory.planar_graph``."""
         if self._log.steps == 0:
             return None
         back_end, graph = self._back_end, self._back_end.graph
-        stamps_ns = self._log.stamps_ns.values[self.vertices]
-        return graph_of(stamps_ns, graph.poses.copy(), *back_end.measurements(), back_end.belief())
+        stamps_ns = self._log.stamps_ns.values[graph.frames.nodes]
+        found = graph_of(stamps_ns, graph.poses.copy(), *back_end.measurements(), back_end.belief())
+        return replace(found, ranks=graph.rank_of_frames[graph.frames.nodes])
 
     @property
     def identity(self) -> dict[str, Any]:

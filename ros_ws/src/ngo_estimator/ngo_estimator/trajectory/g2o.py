@@ -46,6 +46,7 @@ class PlanarGraph:
     the first, with ``information`` ``(m, 3, 3)`` along the first's axes, positive definite but for rows and columns of
     zeros, of which nobody knows anything. ``is_loop`` ``(m,)`` marks loops, ``belief`` ``(m,)``, zero to one, is NaN
     where nothing is said. ``fixed`` are the ids that stay where they are, ``remarks`` what was not read.
+    ``ranks`` ``(n,)`` name the drive of each vertex where there are several.
     """
 
     ids: np.ndarray
@@ -58,6 +59,7 @@ class PlanarGraph:
     belief: np.ndarray
     fixed: tuple[int, ...] = ()
     remarks: tuple[str, ...] = ()
+    ranks: np.ndarray | None = None
 
     def with_beliefs(self, poses: np.ndarray, is_loop: np.ndarray, belief: np.ndarray) -> "PlanarGraph":
         """The same graph after it was corrected."""
