@@ -165,7 +165,7 @@ def _spread(nodes: np.ndarray, odds: np.ndarray, cell: int) -> np.ndarray:
 
     The likeliest of all lie where the chain is short and leave most of a long one alone.
     """
-    cells = np.unique(nodes // cell, axis=0, return_inverse=True)[1].ravel()
+    cells = np.unique(np.sort(nodes, axis=1) // cell, axis=0, return_inverse=True)[1].ravel()
     order = np.lexsort((-odds, cells))
     first = np.searchsorted(cells[order], cells[order])
     rank = np.empty(len(odds), np.int64)
