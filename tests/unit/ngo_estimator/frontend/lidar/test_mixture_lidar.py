@@ -9,6 +9,7 @@ import pytest
 
 from ngo_estimator.data.relative_step import check_step
 from ngo_estimator.frontend.lidar.lidar_step import LidarStep
+from ngo_estimator.frontend.lidar.mixture_config import MixtureConfig
 from ngo_estimator.frontend.lidar.mixture_lidar import MixtureLidar
 from ngo_estimator.frontend.rejected_frames import DuplicateFrame, LateFrame, UnusableImage
 from ngo_estimator.geometry.planar_motion import between, compose
@@ -61,6 +62,13 @@ def fed(given: Iterable[LidarScan | WheelPose], lidar: MixtureLidar | None = Non
 def off(steps: list[LidarStep], poses: np.ndarray) -> float:
     last = between(between(poses[0], poses[-1]), steps[-1].odom_xyyaw)
     return math.hypot(last[0], last[1]) + abs(last[2])
+
+
+@pytest.mark.parametrize("weights", [(0.45, 0.2, 0.0, 0.0, 0.0, 0.03), (0.0, 0.0, 0.0, 0.0, 0.0, 1.0)])
+def test_where_anything_alone_is_left_it_is_searched(weights: tuple[float, ...]) -> None:
+    poses = way(20)
+    steps = fed(records(poses, wheels=False), MixtureLidar(MixtureConfig(first_weights=weights)))
+    assert len(steps) == 19 and off(steps, poses) < 0.05
 
 
 @pytest.mark.parametrize("wheels", [True, False])

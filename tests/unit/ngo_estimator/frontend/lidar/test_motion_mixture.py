@@ -103,6 +103,7 @@ def test_a_hypothesis_of_no_weight_is_not_formed_and_anything_stays() -> None:
     mixture.foretell(0.0, np.array((0.1, 0.0, 0.0)), np.array((0.1, 0.0, 0.0)), 1.0)
     assert mixture.usable == [1, 3, 4, 5]
     mixture.learn(np.array((0.1, 0.0, 0.0)), 1e-6 * np.eye(3))
+    assert mixture.weights[[0, 2]].tolist() == [0.0, 0.0] and abs(mixture.weights.sum() - 1.0) < 1e-12
     mixture.foretell(0.0, None, None, 1.0)
     assert mixture.usable == [3, 4, 5]
     with pytest.raises(ValueError, match="first_weights"):

@@ -298,7 +298,7 @@ class MixtureOdometry:
     def _starts(self) -> list[int]:
         """The hypotheses but anything, without those that say no more than one before."""
         mixture, same = self.mixture, (self.config.same_m, self.config.same_rad)
-        usable, deviations = np.array(mixture.usable[:-1]), mixture.deviations
+        usable, deviations = np.array(mixture.usable[:-1], dtype=int), mixture.deviations
         distinct: list[int] = usable[_distinct(mixture.steps[usable], deviations[usable], *same)].tolist()
         return distinct
 

@@ -276,7 +276,7 @@ def _learned(
     for k in range(6):
         if usable[k]:
             weights[k] += rate * (held * shares[k] - weights[k])
-    weights[:] = np.maximum(weights, least_weight)
+    weights[:] = np.where(weights > 0.0, np.maximum(weights, least_weight), 0.0)
     weights /= weights.sum()
     for k in range(6):
         for i in range(2):
