@@ -9,7 +9,9 @@ from ngo_estimator.geometry.view_pose import camera_at
 
 SIZE_M = np.array((8.0, 6.0, 3.0))
 _CELL_M = 0.12
-_PAINT = np.random.default_rng(5).integers(0, 256, (6, 80, 80)).astype(np.float64)
+PLAIN = np.random.default_rng(5).integers(0, 256, (6, 80, 80)).astype(np.float64)
+TILES = np.tile(PLAIN[:, :3, :3], (1, 27, 27))[:, :80, :80]
+"""Paint of walls that repeat each 0.36 m."""
 
 
 def camera(width: int = 320) -> CameraModel:
@@ -27,7 +29,7 @@ def rays_of(model: CameraModel) -> np.ndarray:
     return model.rays(np.stack((across.ravel(), down.ravel()), axis=1).astype(np.float64))
 
 
-def picture(model: CameraModel, rays: np.ndarray, pose: np.ndarray) -> np.ndarray:
+def picture(model: CameraModel, rays: np.ndarray, pose: np.ndarray, walls: np.ndarray = PLAIN) -> np.ndarray:
     """What the camera of a robot at ``pose`` ``(3,)`` sees, ``(height, width, 1)`` uint8."""
     origin = camera_at(pose, model.centre)
     towards = rays @ turn_matrices(pose[2:])[0].T
@@ -40,8 +42,8 @@ def picture(model: CameraModel, rays: np.ndarray, pose: np.ndarray) -> np.ndarra
     paint = 2 * wall + (towards[rows, wall] > 0.0)
     i, j = np.floor(across).astype(int) % 80, np.floor(up).astype(int) % 80
     a, b = across % 1.0, up % 1.0
-    near, far = _PAINT[paint, i, j], _PAINT[paint, (i + 1) % 80, j]
-    side, corner = _PAINT[paint, i, (j + 1) % 80], _PAINT[paint, (i + 1) % 80, (j + 1) % 80]
+    near, far = walls[paint, i, j], walls[paint, (i + 1) % 80, j]
+    side, corner = walls[paint, i, (j + 1) % 80], walls[paint, (i + 1) % 80, (j + 1) % 80]
     grey = (1 - a) * (1 - b) * near + a * (1 - b) * far + (1 - a) * b * side + a * b * corner
     return grey.reshape(model.height, model.width, 1).astype(np.uint8)
 

@@ -7,13 +7,12 @@ import numpy as np
 import pytest
 
 from ngo_estimator.data.relative_step import RelativeStep
-from ngo_estimator.frontend.camera import tracked_odometry
 from ngo_estimator.frontend.camera.feature_tracks import corners, followed, found_from_elsewhere
 from ngo_estimator.frontend.camera.picture_odometry import PictureOdometry
 from ngo_estimator.frontend.camera.tracked_odometry import _likelier
 from ngo_estimator.geometry.planar_motion import between
 from ngo_estimator.geometry.view_pose import ViewPose
-from tests.unit.ngo_estimator.rendered_room import by_wheels, camera, drive, picture, rays_of
+from tests.unit.ngo_estimator.rendered_room import PLAIN, TILES, by_wheels, camera, drive, picture, rays_of
 
 PERIOD_NS = 100_000_000
 
@@ -114,22 +113,23 @@ def test_corners_of_stripes_are_found_only_where_they_are_expected() -> None:
         assert len(at) > 10 and found.all() and shares[0] <= again.mean() <= shares[1]
 
 
-def test_a_picture_is_no_surer_than_the_wheels_where_corners_are_found_only_where_they_are_expected(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    model, truth = camera(160), drive(6)
+def heading_stds(walls: np.ndarray, width: int, stride: int) -> np.ndarray:
+    """Deviations (rad) of the heading of each step of a drive past such walls."""
+    model, truth = camera(width), drive(6 * stride)[::stride]
     rays, wheels = rays_of(model), by_wheels(truth)
+    odometry, steps = PictureOdometry(model), list[RelativeStep]()
+    for k, pose in enumerate(truth):
+        odometry.add_wheels(k * PERIOD_NS, wheels[k])
+        odometry.add_picture(k * PERIOD_NS, picture(model, rays, pose, walls))
+        steps += odometry.ready()
+    return np.sqrt([step.covariance[2, 2] for step in steps])
 
-    def driven() -> list[RelativeStep]:
-        odometry, steps = PictureOdometry(model), list[RelativeStep]()
-        for k, pose in enumerate(truth):
-            odometry.add_wheels(k * PERIOD_NS, wheels[k])
-            odometry.add_picture(k * PERIOD_NS, picture(model, rays, pose))
-            steps += odometry.ready()
-        return steps
 
-    sure = driven()
-    monkeypatch.setattr(tracked_odometry, "found_from_elsewhere", lambda *args: np.zeros(len(args[2]), bool))
-    for step, unsure in zip(sure, driven(), strict=True):
-        assert np.array_equal(step.relative_xyyaw, unsure.relative_xyyaw)
-        assert math.sqrt(step.covariance[2, 2]) < 0.01 < math.sqrt(unsure.covariance[2, 2]) < 0.03
+def test_a_picture_is_no_surer_than_the_wheels_where_walls_repeat() -> None:
+    by_wheels_alone = heading_stds(np.zeros_like(TILES), 160, 2)
+    assert (heading_stds(TILES, 160, 2) > 0.99 * by_wheels_alone).all()
+    assert (heading_stds(PLAIN, 160, 2) < 0.3 * by_wheels_alone).all()
+
+
+def test_a_wide_picture_is_surer_than_the_wheels_where_nothing_repeats() -> None:
+    assert (heading_stds(PLAIN, 640, 1) < 0.3 * heading_stds(np.zeros_like(PLAIN), 640, 1)).all()
