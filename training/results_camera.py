@@ -7,7 +7,8 @@
 
 A drive of the explorer on each map. The motion given is that of wheels with errors (``given_motion``). The command
 prints a table and writes ``training/results/camera.json``: each drive, and rows with means over drives. Run it again to
-continue after a stop; one that is restricted adds to what the code of today has measured.
+continue after a stop. Drives of as many frames that are published and that the code of today has not measured stay, and
+name their revision.
 """
 
 import json
@@ -32,6 +33,9 @@ from training.scoring.table import Drive, Numbers, Row, Rows, interval_of, measu
 
 _MAPS = {"validation": VALIDATION_MAPS, "test": TEST_MAPS}
 _FIRST_SEED = {"validation": 10_000, "test": 20_000}
+_Drives = dict[str, dict[str, Any]]
+"""By the drive's name its numbers; ``revision`` where an older one measured them."""
+
 _DRIVE_CODE, _ROW_CODE = (episodes, maze3d), (camera_rows, picture_odometry, picture_trajectory)
 
 
@@ -65,7 +69,12 @@ def main(arguments: Arguments) -> dict[str, Any]:
         )
     measure(asked, folder, f"camera {arguments.split}")
     known = {name: of[arguments.without] for name, of in measure(plan, folder, known_only=True).items() if of}
-    drives = {name: {key: float(value[0]) for key, value in of.errors.items()} for name, of in known.items()}
+    drives: _Drives = {name: {key: float(value[0]) for key, value in of.errors.items()} for name, of in known.items()}
+    split = "" if arguments.split == "test" else f".{arguments.split}"
+    ablation = "" if arguments.without == "nothing" else f".no_{arguments.without}"
+    path = arguments.results / f"camera{split}{ablation}.json"
+    if path.is_file():
+        drives = _with_published(drives, json.loads(path.read_text()), arguments.frames)
     result = {
         **records.record("results_camera", arguments),
         "odometry": asdict(CameraConfig()),
@@ -74,13 +83,17 @@ def main(arguments: Arguments) -> dict[str, Any]:
         "median": _medians(list(drives.values())),
         "tables": {"doom": _rows(list(drives.values()))},
     }
-    split = "" if arguments.split == "test" else f".{arguments.split}"
-    ablation = "" if arguments.without == "nothing" else f".no_{arguments.without}"
-    path = arguments.results / f"camera{split}{ablation}.json"
     records.write_at_once(path, json.dumps(result, indent=1, default=str) + "\n")
     for name, numbers in {**drives, f"median, {len(drives)} drives": result["median"]}.items():
-        print(name, {key: round(value, 3) for key, value in numbers.items()})
+        print(name, {key: value if key == "revision" else round(value, 3) for key, value in numbers.items()})
     return result
+
+
+def _with_published(drives: _Drives, published: dict[str, Any], frames: int) -> _Drives:
+    """What is ``published`` of drives of so many frames, with its revision, below what today's code has measured."""
+    if published["arguments"]["frames"] != frames:
+        return drives
+    return {name: {"revision": published["revision"], **of} for name, of in published["drives"].items()} | drives
 
 
 def _drives(arguments: Arguments) -> list[Drive]:
@@ -94,7 +107,7 @@ def _drives(arguments: Arguments) -> list[Drive]:
     return drives
 
 
-def _rows(drives: list[dict[str, float]]) -> dict[str, Numbers]:
+def _rows(drives: list[dict[str, Any]]) -> dict[str, Numbers]:
     """Means over drives, with intervals of 95 %, of what was given, of the odometry, and of the corrected path."""
 
     def mean(key: str, of: str = "") -> dict[str, Any]:
@@ -111,8 +124,9 @@ def _rows(drives: list[dict[str, float]]) -> dict[str, Numbers]:
     return rows
 
 
-def _medians(drives: list[dict[str, float]]) -> dict[str, float]:
-    medians = {name: float(np.median([one[name] for one in drives])) for name in drives[0]}
+def _medians(drives: list[dict[str, Any]]) -> dict[str, float]:
+    names = [name for name in drives[0] if name != "revision"]
+    medians = {name: float(np.median([one[name] for one in drives])) for name in names}
     shares = [one["corrected_ate_m"] / one["given_ate_m"] for one in drives]
     return {**medians, "corrected_share": float(np.median(shares)), "worst_share": float(np.max(shares))}
 

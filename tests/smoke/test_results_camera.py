@@ -6,14 +6,24 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from ngo_estimator.frontend.camera import tracked_odometry
+from ngo_estimator.geometry import planar_views
 from ngo_estimator.geometry.view_pose import camera_at
 from ngo_estimator.loops import picture_fit
 from tests.unit.ngo_estimator.geometry.test_planar_views import MOTION, points, seen
 from tests.unit.ngo_estimator.rendered_room import camera
 from training import results_camera
 from training.scoring import camera_rows
+from training.scoring.table import Measured
 
 pytestmark = pytest.mark.slow
+
+SOLVING = (tracked_odometry, picture_fit)
+
+PUBLISHED = dict.fromkeys(
+    (f"{row}_{of}" for row in ("given", "odometry", "corrected") for of in ("ate_m", "final_percent")), 1.0
+)
+PUBLISHED |= {"within_3_std": 1.0, "frames_a_second": 40.0, "loops": 1.0}
 
 
 @pytest.mark.parametrize("without", ["tracks", "points", "planar", "sift", "corrector"])
@@ -25,7 +35,9 @@ def test_an_ablation_has_a_file_of_its_own(without: str, tmp_path: Path, monkeyp
     assert [path.name for path in tmp_path.glob("*.json")] == [f"camera.no_{without}.json"]
     assert (drive["odometry_ate_m"] == pytest.approx(drive["given_ate_m"])) == (without == "tracks")
     odometry, graph = camera_rows.estimators(camera(), without)
-    assert (picture_fit.ransac is camera_rows.five_points) == (without == "planar")
+    with camera_rows.solver(without):
+        assert all((module.ransac is camera_rows.five_points) == (without == "planar") for module in SOLVING)
+    assert all(module.ransac is planar_views.ransac for module in SOLVING)
     assert isinstance(odometry._describer, camera_rows._Orb) == (without == "sift")
     assert isinstance(graph._new_back_end()._corrector, camera_rows._Believes) == (without == "corrector")
 
@@ -53,3 +65,22 @@ def test_a_short_drive_on_a_map(tmp_path: Path, monkeypatch: pytest.MonkeyPatch)
         0.5 * (drive["corrected_ate_m"] + other["corrected_ate_m"])
     )
     assert json.loads((tmp_path / "camera.json").read_text())["median"] == result["median"]
+
+
+def test_a_restricted_command_keeps_the_published_drives_that_it_does_not_measure(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(results_camera, "camera_drive", lambda *_, **__: None)
+    monkeypatch.setattr(results_camera, "measured", lambda *_, **__: Measured.of({**PUBLISHED, "loops": 3.0}))
+    older, named = dict.fromkeys(("take_cover MAP01 20000", "elsewhere MAP07 20000"), PUBLISHED), ("take_cover",)
+    path = tmp_path / "camera.json"
+    path.write_text(json.dumps({"arguments": {"frames": 24}, "revision": "abc", "drives": older}))
+    monkeypatch.setitem(results_camera._MAPS, "test", (("take_cover.wad", "MAP01"), ("elsewhere.wad", "MAP07")))
+    for folder in ("runs", "fresh"):  # what the second one finds in the file, it must not call its own
+        arguments = results_camera.Arguments(frames=24, named=named, results=tmp_path, runs=tmp_path / folder)
+        result = results_camera.main(arguments)
+        anew, kept = (result["drives"][name] for name in older)
+        assert anew == {**PUBLISHED, "loops": 3.0} and kept == {**PUBLISHED, "revision": "abc"}
+        assert result["median"]["loops"] == 2.0
+    arguments = results_camera.Arguments(frames=25, named=named, results=tmp_path, runs=tmp_path / "runs")
+    assert [*results_camera.main(arguments)["drives"]] == ["take_cover MAP01 20000"]  # others are of other lengths

@@ -1,6 +1,8 @@
 """Drives of a camera through Doom maps, with the motion of simulated wheels, and the rows that are measured on them."""
 
 import time
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any, Literal
 
@@ -144,16 +146,27 @@ def five_points(
 
 
 def estimators(camera: CameraModel, without: Ablation) -> tuple[PictureOdometry, PictureTrajectory]:
-    """Both estimators, without tracked corners, their ranges, the planar solver, SIFT (ORB) or the robust corrector."""
+    """Both estimators, without tracked corners, their ranges, SIFT (ORB) or the robust corrector."""
     settings: dict[str, Any] = {
         "tracks": {"least_inliers": CameraConfig.corners + 1},
         "points": {"range_pixel_std": 1e6},
     }
     config = CameraConfig(**settings.get(without, {}))
-    for module in (tracked_odometry, picture_fit):
-        module.ransac = five_points if without == "planar" else ransac  # type: ignore[attr-defined]
     odometry = PictureOdometry(camera, config, _Orb(config.features) if without == "sift" else None)
     return odometry, _BelievingTrajectory() if without == "corrector" else PictureTrajectory()
+
+
+@contextmanager
+def solver(without: Ablation) -> Iterator[None]:
+    """Meanwhile pairs of pictures are solved by five points, where it is without the planar solver."""
+    modules = (tracked_odometry, picture_fit)
+    try:
+        for module in modules:
+            module.ransac = five_points if without == "planar" else ransac  # type: ignore[attr-defined]
+        yield
+    finally:
+        for module in modules:
+            module.ransac = ransac  # type: ignore[attr-defined]
 
 
 def measured(of: CameraDrive, without: Ablation) -> Measured:
@@ -162,15 +175,16 @@ def measured(of: CameraDrive, without: Ablation) -> Measured:
     odometry, graph = estimators(of.camera, without)
     published, covariances = [], []
     began = time.process_time()  # of one thread, whatever else runs on the machine
-    for frame, picture in enumerate(of.pictures):
-        stamp_ns = round(frame * of.period_s * 1e9)
-        odometry.add_wheels(stamp_ns, of.given[frame])
-        odometry.add_picture(stamp_ns, picture[..., None])
-        for step in odometry.ready():
-            update = graph.update(step)
-            published.append(update.pose_xyyaw)
-            covariances.append(update.covariance)
-    graph.finish()
+    with solver(without):
+        for frame, picture in enumerate(of.pictures):
+            stamp_ns = round(frame * of.period_s * 1e9)
+            odometry.add_wheels(stamp_ns, of.given[frame])
+            odometry.add_picture(stamp_ns, picture[..., None])
+            for step in odometry.ready():
+                update = graph.update(step)
+                published.append(update.pose_xyyaw)
+                covariances.append(update.covariance)
+        graph.finish()
     took_s = time.process_time() - began
     found = graph.trajectory()
     assert found is not None
