@@ -2,7 +2,7 @@
 
     python -m training.results --world maze2d
     python -m training.results --world maze3d
-    python -m training.results --world scan      # of the lidar, and so on: TABLES
+    python -m training.results --world scan      # of the lidar; each of TABLES has its own --help
 
 Missing networks, features, settings of the pose graph and trainings of the optimizers are made first. Every row is
 measured in mazes that nothing was trained or chosen on. The command writes ``training/results/WORLD.json``,
@@ -172,11 +172,14 @@ def command_line(arguments: list[str]) -> None:
     parser = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
     parser.add_argument("--world")
     known, flags = parser.parse_known_args(arguments)
+    names = f"maze2d, maze3d, {', '.join(TABLES)}"
     if known.world in TABLES:
         table = import_module(f"training.{TABLES[known.world]}")
         run_command(table.main, table.Arguments, table.__doc__, flags)
+    elif known.world in (None, "maze2d", "maze3d"):
+        run_command(main, Arguments, f"{__doc__}\nWorlds are {names}.", arguments)
     else:
-        run_command(main, Arguments, __doc__, arguments)
+        sys.exit(f"there is no world {known.world!r}; expected one of {names}")
 
 
 if __name__ == "__main__":

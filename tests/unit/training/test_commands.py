@@ -64,6 +64,16 @@ def test_a_table_gets_the_flags_beside_its_name(world: str, monkeypatch: pytest.
     assert given == 2 * [table.Arguments(runs=Path("here"))]
 
 
+def test_the_one_command_of_tables_names_all_worlds(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit, match=r"^0$"):
+        results.command_line(["--help"])
+    told = " ".join(capsys.readouterr().out.replace("│", " ").split())
+    with pytest.raises(SystemExit) as ended:
+        results.command_line(["--world", "mars"])
+    for text in (told, str(ended.value)):
+        assert f"maze2d, maze3d, {', '.join(results.TABLES)}" in text
+
+
 def test_a_run_that_does_not_fit_ends_a_command_with_one_line(monkeypatch: pytest.MonkeyPatch) -> None:
     def main(_: object) -> None:
         raise RunError("the folder holds another run")
