@@ -15,14 +15,14 @@ are computing times, so that a busy machine does not change them. A peer that co
 stopped: it counts as not solved, and its error is that of the odometry. A cell's name is the kind of its wrong loops
 and their percentage. `_place`: loops know no relative pose, only "the same place". All peers get the stated
 covariances; those of Manhattan are far too large. Rows and cells that are missing were not measured: `--graphs`,
-`--kinds`, `--percents`, `--seeds` and `--rows` measure a part, and only with `--graphs GRAPH_online` do loops come in
-blocks of 120, in the order of their later poses; numbers are means over the blocks. There `robust` goes on from its
-last solution, and `changed` is the share of its verdicts about known loops that changed; `robust_anew` begins anew in
-each block. `hard_` graphs have a poor odometry, and twice as many loops as `synthetic_` ones. A loop counts as
-believed where the poses fit it within its stated threshold. `cheapest` is the share of graphs where the truncated cost
-of what was found is not above that of the right loops' solution. A graph that is not solved there has a cheaper wrong
-solution: no search for a lower cost would find the right one. There is no row `learned`: the one design of four
-that solves more takes twice the time ([notebook](notebook.md#pose-graphs-with-wrong-loops)).
+`--kinds`, `--percents`, `--seeds` and `--rows` measure a part. In `GRAPH_online` loops come in blocks of 120, in the
+order of their later poses, and numbers are means over the blocks. There `robust` goes on from its last solution, and
+`robust_anew` begins anew in each block; `changed` is the share of verdicts about known loops that changed. `hard_`
+graphs have a poor odometry, and twice as many loops as `synthetic_` ones. A loop counts as believed where the poses
+fit it within its stated threshold. `cheapest` is the share of graphs where the truncated cost of what was found is not
+above that of the right loops' solution. A graph that is not solved there has a cheaper wrong solution: no search for a
+lower cost would find the right one. Four designs of networks that judge loops or solutions were tried: one solves more
+graphs, in 2 to 2.8 times the time ([notebook](notebook.md#pose-graphs-with-wrong-loops)).
 
 | kind | wrong loops |
 |---|---|
