@@ -43,7 +43,6 @@ from training.scoring.statistics import mean_interval
 from training.scoring.table import (
     Drive,
     Measured,
-    Numbers,
     Row,
     Table,
     column,
@@ -128,7 +127,8 @@ def main(arguments: Arguments) -> dict[str, Any]:
         "places": {kind: len(table) for kind, table in found.items()},
         "poses": {kind: "own" if kind in WHEELS else "true" for kind in found},
         "tables": {
-            kind: {row: _numbers(table, row) for row in names if column(table, row)} for kind, table in found.items()
+            kind: {row: intervals(samples(column(table, row))) for row in names if column(table, row)}
+            for kind, table in found.items()
         },
         "paired": {
             kind: {row: _paired(table, row) for row in names if row != BASE and column(table, row)}
@@ -231,11 +231,6 @@ def scores(run: Explored, seen: Seen) -> dict[str, float]:
     if np.isfinite(run.path_to(ENOUGH)):
         found["path_to_95_m"] = run.path_to(ENOUGH)
     return found
-
-
-def _numbers(table: Table, row: str) -> Numbers:
-    """``{mean, ci95}`` by metric; ``ate_m`` is empty at true poses."""
-    return {"ate_m": {"mean": None, "ci95": None}, **intervals(samples(column(table, row)))}
 
 
 def _paired(table: Table, row: str) -> dict[str, Any]:

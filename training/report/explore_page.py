@@ -20,7 +20,6 @@ _COLUMNS = (
     Column("collisions", "Collisions a km", number),
     Column("decision_ms", "Decision, 99 %, ms", number),
 )
-_OF_OWN_POSES = ("iou_true_poses", "ate_m", "ate_end_m", "within")
 _ROWS = {
     "random": "random",
     "nearest": "nearest frontier",
@@ -54,8 +53,8 @@ _KINDS = {
 }
 _POSES = {
     "true": "The robot knows its **true poses**: no row says anything about the error of the estimator.",
-    "own": "Poses and map are **those of the lidar's estimators**. ATE is of the trajectory when 95 % had "
-    "been seen, and at the end, after the best rigid alignment. A pose is within three deviations by its covariance "
+    "own": "Poses and map are **those of the lidar's estimators**. ATE is of the trajectory as it was "
+    "known then, after the best rigid alignment. A pose is within three deviations by its covariance "
     "when it was the newest.",
 }
 
@@ -75,7 +74,9 @@ def page(result: Mapping[str, Any]) -> str:
             ratio = result["paired"][kind].get(row, {}).get("path_to_95_ratio")
             shown[_ROWS[row]] = {**numbers, "ratio": ratio} if ratio else numbers
         poses = result["poses"][kind]
-        columns = [column for column in _COLUMNS if poses == "own" or column.key not in _OF_OWN_POSES]
+        columns = [column for column in _COLUMNS if any(column.cell(numbers) for numbers in shown.values())]
+        if poses == "true":  # both maps are of the same path
+            columns = [column for column in columns if column.key != "iou_true_poses"]
         settings, places = measured["settings"], result["places"][kind]
         scaled = "" if kind in ("mazes", "plans") else f", corridors of {settings['scale']:g} of the usual length"
         told = {**measured, **settings, "places": places, "scaled": scaled, "poses": _POSES[poses]}
