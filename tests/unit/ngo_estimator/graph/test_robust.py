@@ -11,6 +11,7 @@ from ngo_estimator.geometry.se2 import between
 from ngo_estimator.graph import robust
 from ngo_estimator.graph.corrector import GraphProblem, normal_equations
 from ngo_estimator.graph.cycle_agreement import ChainUncertainty, chain_poses
+from ngo_estimator.graph.graduated import graduate
 from ngo_estimator.graph.loop_errors import squared_and_log
 from ngo_estimator.graph.relative_poses import RelativePoses
 from ngo_estimator.graph.robust import Robust
@@ -258,6 +259,28 @@ def test_what_a_graph_predicts_of_loops_is_as_sure_as_dense_matrices_say() -> No
     squared, logs = squared_and_log(residuals, predicted)
     np.testing.assert_allclose(squared, np.einsum("ki,kij,kj->k", residuals, np.linalg.inv(total), residuals))
     np.testing.assert_allclose(logs, np.linalg.slogdet(total)[1])
+
+
+def test_where_a_factor_does_not_hold_all_places_two_choices_of_them_are_tried(monkeypatch: pytest.MonkeyPatch) -> None:
+    problem, true = square(4, 2, 4 * ROUND, metric=False)
+    nodes = problem.loops.nodes.copy()
+    nodes[: 2 * ROUND : 2, 1] += ROUND * (nodes[: 2 * ROUND : 2, 0] <= 2 * ROUND)  # to the next round but one
+    problem = replace(problem, loops=replace(problem.loops, nodes=nodes))
+    given: list[np.ndarray] = []
+
+    def solved(part: GraphProblem, *rest: Any, **more: Any) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        given.append(part.loops.nodes)
+        return graduate(part, *rest, **more)
+
+    monkeypatch.setattr(robust, "_MOST_FILLED", 3000)
+    monkeypatch.setattr(robust, "graduate", solved)
+    solution = Robust().correct(problem)
+    first, second = given[:2]
+    assert max(len(first), len(second)) < 2 * ROUND and not np.array_equal(first, second)
+    right = np.arange(len(problem.loops)) < 2 * ROUND
+    believed = solution.loop_weights > 0.0
+    assert believed[right].mean() > 0.9 and believed[~right].mean() < 0.05
+    assert worst(solution.poses, true) < 0.5 * worst(problem.poses, true)
 
 
 def test_the_likeliest_of_each_place_come_first_and_what_is_ruled_out_last() -> None:
