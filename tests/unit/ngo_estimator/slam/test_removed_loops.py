@@ -63,7 +63,9 @@ def test_the_graph_of_a_lidar_is_what_was_solved(lidar: ScanTrajectory) -> None:
 def test_without_a_loop_a_lidar_has_the_poses_that_the_others_give(lidar: ScanTrajectory) -> None:
     core = lidar.restored(lidar.state())
     chosen, *others = loops_of(core)
+    assert core.loop_report().scales is None  # a state has none
     assert core.remove_loops(*chosen) == 1 and core.fault == ""
+    assert core.loop_report().scales is not None
     assert loops_of(core) == others and core.remove_loops(*chosen) == 0
     steps, loops = core.back_end.measurements()
     alone = Robust().correct(GraphProblem(graph_of(lidar).poses, steps, loops, np.ones(len(loops))))

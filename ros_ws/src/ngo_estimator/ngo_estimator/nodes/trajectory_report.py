@@ -54,7 +54,9 @@ class TrajectoryReport:
             "loops": str(update.closed_loops),
             "loops believed, doubted, refused": f"{loops.believed}, {loops.doubted}, {loops.refused}",
             "newest loop that is refused": loops.newest_refused or "none",
-            "variances of steps, of loops (times as stated)": "{:.3g}, {:.3g}".format(*loops.scales),
+            "variances of steps, of loops (times as stated)": (
+                "{:.3g}, {:.3g}".format(*loops.scales) if loops.scales else "not measured yet"
+            ),
             "last correction, largest move (m)": f"{self._last_correction_m:.3f}",
             "standard deviation of the position (m)": f"{position_std(covariance):.3g}",
             "map_from_odom (x m, y m, yaw rad)": f"{x:.3f} {y:.3f} {yaw:.4f}",

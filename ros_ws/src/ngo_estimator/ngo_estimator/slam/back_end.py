@@ -60,8 +60,9 @@ class BackEnd(ABC):
         """What failed in the last ``work`` or ``finish``, in words; empty where nothing did."""
         self.took_s = 0.0
         """Computing time of the last work that ended with an optimisation."""
-        self.scales = 1.0, 1.0
-        """How many times as large as stated the last optimisation found the variances of steps and of loops."""
+        self.scales: tuple[float, float] | None = None
+        """How many times as large as stated the last optimisation found the variances of steps and of loops; None
+        before one measured them, as after loading."""
 
     @abstractmethod
     def checked(self, step: RelativeStep) -> RelativeStep:

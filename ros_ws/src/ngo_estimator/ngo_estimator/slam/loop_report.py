@@ -15,14 +15,14 @@ REFUSED_BELOW = 0.1
 class LoopReport:
     """Counts of loops; ``newest_refused`` says how far the newest one that is refused is off, empty without any.
 
-    The variances of steps and of loops were found to be ``scales`` times as large as stated.
+    The variances of steps and of loops were found to be ``scales`` times as large as stated; None before that.
     """
 
     believed: int
     doubted: int
     refused: int
     newest_refused: str
-    scales: tuple[float, float]
+    scales: tuple[float, float] | None
 
 
 def loop_report(
@@ -32,7 +32,7 @@ def loop_report(
     waiting: int,
     stamps_ns: np.ndarray,
     poses: np.ndarray,
-    scales: tuple[float, float],
+    scales: tuple[float, float] | None,
 ) -> LoopReport:
     """The report of loops between frames ``pairs`` ``(n, 2)``.
 
