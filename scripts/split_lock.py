@@ -30,6 +30,9 @@ def main(whole: Path, lidar: Path, kilted: Path, torch_hashes: list[str]) -> Non
             build = [entry.split()[0] + "+cpu", *(f"--hash=sha256:{one}" for one in torch_hashes)]
             parts["locked_cpu"].append(" \\\n    ".join(build) + "\n")
     parts["locked_ros_kilted"] = [f"{entry.rstrip()}\n" for entry in _entries(kilted) if entry.startswith("ros-")]
+    locked, of_kilted = ({entry.partition("==")[0] for entry in _entries(lock)} for lock in (whole, kilted))
+    if missing := sorted(name for name in of_kilted - locked if not name.startswith("ros-")):
+        sys.exit(f"split_lock: ROS 2 Kilted needs {', '.join(missing)}, which the other locks do not have")
     for kind, entries in parts.items():
         path = REQUIREMENTS / f"{kind}.txt"
         comments = [line for line in path.read_text().splitlines(keepends=True) if line.startswith("#")]

@@ -11,28 +11,35 @@ import pytest
 from ngo_common.nodes import process
 
 pytestmark = pytest.mark.processes
-FILE = "FASTRTPS_DEFAULT_PROFILES_FILE"
+FILES = {
+    "jazzy": ("FASTRTPS_DEFAULT_PROFILES_FILE", "fast_dds.xml"),
+    "kilted": ("FASTDDS_DEFAULT_PROFILES_FILE", "fast_dds_3.xml"),
+}
 
 
-NODE_THAT_REFUSES = f"""
-import os
+NODE_THAT_REFUSES = """
+import os, sys
 from ngo_common.nodes import process
 def refuse():
     raise process.StartError("this node does not start")
 assert process.run_node("node", refuse, "", args=["node"]) == 2
-print(os.environ["{FILE}"])
+print(os.environ[sys.argv[1]])
 """
 
 
+@pytest.mark.parametrize("distro", FILES)
 @pytest.mark.parametrize("named", [None, "/of/the/user.xml"])
-def test_a_user_names_other_settings(named: str | None) -> None:
-    environment = {name: value for name, value in os.environ.items() if name != FILE} | ({FILE: named} if named else {})
+def test_a_user_names_other_settings(named: str | None, distro: str) -> None:
+    variable, ours = FILES[distro]
+    names = {variable for variable, _ in FILES.values()}
+    environment = {name: value for name, value in os.environ.items() if name not in names}
+    environment |= {"ROS_DISTRO": distro} | ({variable: named} if named else {})
     # A process of its own: one that runs a node keeps the node's handlers of signals.
     run = subprocess.run(
-        [sys.executable, "-c", NODE_THAT_REFUSES], env=environment, capture_output=True, text=True, check=True
+        [sys.executable, "-c", NODE_THAT_REFUSES, variable], env=environment, capture_output=True, text=True, check=True
     )
     used = Path(run.stdout.strip())
-    assert used == Path(named) if named else used.is_file()
+    assert used == Path(named) if named else (used.is_file() and used.name == ours)
 
 
 @pytest.mark.parametrize(
