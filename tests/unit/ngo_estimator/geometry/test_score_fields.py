@@ -76,12 +76,14 @@ def test_what_other_scans_saw_through_is_no_wall() -> None:
     assert counts.walls(person).tolist() == [True]
 
 
-def test_a_widened_hypothesis_stands_alone_and_keeps_its_mass() -> None:
-    """Ten times as wide in position and twice in heading: a density of a 200th at the mean."""
+def test_a_widened_hypothesis_keeps_its_mass() -> None:
+    """Ten times as wide in position and twice in heading: a density of a 200th at the mean, and others as before."""
     prior = mixture(0)
-    wide = prior.widened(2.0, 0.4)
-    np.testing.assert_allclose(wide.deviations, [(2.0, 0.4)])
-    assert wide.logs(prior.means[2]) == pytest.approx(prior.logs(prior.means[2])[2] - math.log(200.0))
+    wide, alone = prior.widened(2.0, 0.4), prior.widened(2.0, 0.4, alone=True)
+    np.testing.assert_allclose(wide.deviations[-1], (2.0, 0.4))
+    assert wide.logs(prior.means[2])[2] == pytest.approx(prior.logs(prior.means[2])[2] - math.log(200.0))
+    np.testing.assert_array_equal(wide.logs(prior.means[0])[:2], prior.logs(prior.means[0])[:2])
+    np.testing.assert_array_equal(alone.logs(prior.means[0]), wide.logs(prior.means[0])[2:])
 
 
 SETTINGS = {"unknown": 0.97, "noise": 0.5, "weight": 0.025}

@@ -28,11 +28,14 @@ class Mixture:
     deviations: Array
     log_weights: Array
 
-    def widened(self, metres: float, radians: float) -> "Mixture":
-        """The last hypothesis alone, with at least these deviations."""
-        deviations = np.maximum(self.deviations[-1:], (metres, radians))
+    def widened(self, metres: float, radians: float, alone: bool = False) -> "Mixture":
+        """The same where the last hypothesis has at least these deviations, or it ``alone``."""
+        first = len(self.means) - 1 if alone else 0
+        deviations, logs = self.deviations[first:].copy(), self.log_weights[first:].copy()
+        deviations[-1] = np.maximum(deviations[-1], (metres, radians))
         ratio = np.log(deviations[-1] / self.deviations[-1])
-        return Mixture(self.means[-1:], deviations, self.log_weights[-1:] - 2.0 * ratio[0] - ratio[1])
+        logs[-1] -= 2.0 * ratio[0] + ratio[1]
+        return Mixture(self.means[first:], deviations, logs)
 
     def log(self, pose: Array) -> float:
         """Logarithm of the density of the hypothesis that is likeliest at a pose ``(3,)``."""

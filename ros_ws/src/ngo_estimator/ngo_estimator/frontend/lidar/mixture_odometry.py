@@ -227,7 +227,9 @@ class MixtureOdometry:
         """
         least = self.config.least, self.config.least
         prior = self.mixture.prior(self._pose, self._covariance + self._doubted_key, walls, least)
-        return prior.widened(0.5 * self.config.most_window_m, 0.5 * math.pi) if wide else prior
+        if not wide:
+            return prior
+        return prior.widened(0.5 * self.config.most_window_m, 0.5 * math.pi, not self.mixture.trusts_wheels)
 
     def _weight(self, points: Array) -> float:
         """Weight of a log likelihood against a score, which is a mean: of few points it says less, but neighbouring
@@ -265,7 +267,8 @@ class MixtureOdometry:
                     fits.append(replace(fit, total=fit.total - config.noise * weight))
             fits.sort(key=lambda fit: -fit.total)
             best = fits[0]
-            if best.score >= config.new_share * usual or (reach != LIKELY and self._fits(points, best.pose)):
+            enough = reach != LIKELY or self.mixture.trusts_wheels
+            if best.score >= config.new_share * usual or (enough and self._fits(points, best.pose)):
                 return self._doubted([self._sharpened(scan, few, best), *fits[1:]], weight)
         return None
 

@@ -137,6 +137,11 @@ class MotionMixture:
         """The hypothesis of the largest weight, of those that can be formed."""
         return int(np.where(self._usable, self._weights, 0.0).argmax())
 
+    @property
+    def trusts_wheels(self) -> bool:
+        """Whether wheels are the heaviest: without them nothing but the scan tells how far the robot went."""
+        return self.heaviest in (TIGHT, LOOSE)
+
     def likeliest(self, pose: Array, mixture: Mixture) -> int:
         """The hypothesis that is likeliest at a pose ``(3,)`` under the ``mixture`` as walls measure it.
 
