@@ -12,6 +12,9 @@ _STOP = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 20, 0.02)
 _BACK_PX = 1.0
 """A corner that is followed back must come out so near to where it was."""
 
+_ALIKE = 4.0
+"""Residual of another place, by that of the right one, below which they look alike."""
+
 
 def followed(before: Grey, now: Grey, pixels: Array, guess: Array) -> tuple[Array, np.ndarray]:
     """Where corners ``(n, 2)`` of one picture are in the next, and which were found ``(n,)``.
@@ -37,17 +40,22 @@ def followed(before: Grey, now: Grey, pixels: Array, guess: Array) -> tuple[Arra
     return at, (found.ravel() == 1) & (again.ravel() == 1) & (off < _BACK_PX) & inside
 
 
-def found_from_elsewhere(before: Grey, now: Grey, pixels: Array, there: Array, elsewhere: Array) -> np.ndarray:
-    """Which corners ``(n,)`` that were followed are found again where the search back begins ``elsewhere`` ``(n, 2)``.
+def repeated(before: Grey, now: Grey, pixels: Array, there: Array, elsewhere: Array) -> np.ndarray:
+    """Which corners ``(n,)`` that were followed look alike elsewhere: of these, what was found is what was expected.
 
-    Of a texture that repeats the others are not: what was found is what was expected.
+    The search back begins ``elsewhere`` ``(n, 2)``. It ends at another place than where the corner was, and fits there
+    by less than four times the residual (mean grey levels of a pixel; one at least) of the right place.
     """
     if len(pixels) == 0:
         return np.zeros(0, bool)
-    start, hint = (np.ascontiguousarray(at, np.float32).reshape(-1, 1, 2) for at in (there, elsewhere))
-    flags = cv2.OPTFLOW_USE_INITIAL_FLOW
-    back, again, _ = cv2.calcOpticalFlowPyrLK(now, before, start, hint, None, None, _WINDOW, 1, _STOP, flags)
-    return (again.ravel() == 1) & (np.linalg.norm(back.reshape(-1, 2) - pixels, axis=1) < _BACK_PX)
+    start, right, wrong = (np.ascontiguousarray(at, np.float32).reshape(-1, 1, 2) for at in (there, pixels, elsewhere))
+    (_, _, known), (back, again, residual) = (
+        cv2.calcOpticalFlowPyrLK(now, before, start, hint, None, None, _WINDOW, 1, _STOP, cv2.OPTFLOW_USE_INITIAL_FLOW)
+        for hint in (right, wrong)
+    )
+    other = np.linalg.norm(back.reshape(-1, 2) - pixels, axis=1) >= _BACK_PX
+    alike: np.ndarray = residual.ravel() < _ALIKE * np.maximum(known.ravel(), 1.0)
+    return (again.ravel() == 1) & other & alike
 
 
 def corners(grey: Grey, most: int, apart_px: float, taken: Array) -> Array:

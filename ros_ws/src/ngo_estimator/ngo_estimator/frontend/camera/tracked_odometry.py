@@ -12,7 +12,7 @@ from dataclasses import replace
 import numpy as np
 
 from ngo_estimator.frontend.camera.camera_config import CameraConfig
-from ngo_estimator.frontend.camera.feature_tracks import Grey, corners, followed, found_from_elsewhere
+from ngo_estimator.frontend.camera.feature_tracks import Grey, corners, followed, repeated
 from ngo_estimator.geometry import se2
 from ngo_estimator.geometry.camera_model import CameraModel
 from ngo_estimator.geometry.planar_motion import between, compose, turned_covariance, wrap
@@ -46,7 +46,7 @@ _OFF = 2.0
 """Deviations of the heading by which corners are also looked for elsewhere."""
 
 _SURE_SHARE = 0.3
-"""Where fewer of the corners that agree are found from elsewhere, too, a picture is no surer than what was given."""
+"""Where fewer of the corners that agree do not repeat, a picture is no surer than what was given."""
 
 _HELD = 100.0
 
@@ -134,7 +134,7 @@ class TrackedOdometry:
         turned, _ = self._model.pixels(base_vectors(self._points, predicted + (0.0, 0.0, _OFF * std), self._centre_now))
         either_way = np.where(np.arange(len(at)) % 2, 1.0, -1.0)[:, None]
         elsewhere = self._pixels + either_way * np.where(near[:, None], turned - guess, 0.0)
-        self._sure = found_from_elsewhere(self._grey, grey, self._pixels, at, elsewhere)[found & near]
+        self._sure = ~repeated(self._grey, grey, self._pixels, at, elsewhere)[found & near]
         self._keep(found & near, at)
 
     def _turn_variance(self, way: float, turn: float, frames: float) -> float:
