@@ -108,9 +108,9 @@ def test_corners_of_stripes_look_alike_elsewhere() -> None:
     for grey, shares in ((cv2.equalizeHist(noise), (0.0, 0.1)), (cv2.equalizeHist(stripes), (0.8, 1.0))):
         at = corners(grey, 60, 6.0, np.zeros((0, 2)))
         at = at[(at > 25.0).all(1) & (at < (135, 95)).all(1)]
-        there, found = followed(grey, grey, at, at)
+        there, found, residual = followed(grey, grey, at, at)
         for offset_px in (8.0, 25.0):
-            alike = repeated(grey, grey, at, there, at + (offset_px, 0.0))
+            alike = repeated(grey, grey, at, there, at + (offset_px, 0.0), residual)
             assert len(at) > 10 and found.all() and shares[0] <= alike.mean() <= shares[1]
 
 

@@ -16,8 +16,9 @@ _ALIKE = 4.0
 """Residual of another place, by that of the right one, below which they look alike."""
 
 
-def followed(before: Grey, now: Grey, pixels: Array, guess: Array) -> tuple[Array, np.ndarray]:
-    """Where corners ``(n, 2)`` of one picture are in the next, and which were found ``(n,)``.
+def followed(before: Grey, now: Grey, pixels: Array, guess: Array) -> tuple[Array, np.ndarray, Array]:
+    """Where corners ``(n, 2)`` of one picture are in the next, which were found ``(n,)``, and the residual of the
+    search back ``(n,)`` (mean grey levels of a pixel).
 
     By pyramids of optical flow (Lucas and Kanade 1981; Bouguet 2001), forth and back.
 
@@ -25,37 +26,39 @@ def followed(before: Grey, now: Grey, pixels: Array, guess: Array) -> tuple[Arra
         guess: where they are expected ``(n, 2)``.
     """
     if len(pixels) == 0:
-        return pixels, np.zeros(0, bool)
-    start = np.ascontiguousarray(pixels, np.float32).reshape(-1, 1, 2)
-    hint = np.ascontiguousarray(guess, np.float32).reshape(-1, 1, 2)
-    flags = cv2.OPTFLOW_USE_INITIAL_FLOW
-    there, found, _ = cv2.calcOpticalFlowPyrLK(
-        before, now, start, hint.copy(), None, None, _WINDOW, _LEVELS, _STOP, flags
-    )
-    back, again, _ = cv2.calcOpticalFlowPyrLK(now, before, there, start.copy(), None, None, _WINDOW, 1, _STOP, flags)
-    off = np.linalg.norm((back - start).reshape(-1, 2), axis=1)
+        return pixels, np.zeros(0, bool), np.zeros(0)
+    there, found, _ = _flow(before, now, pixels, guess, _LEVELS)
+    back, again, residual = _flow(now, before, there, pixels, 1)
+    off = np.linalg.norm(back - pixels.astype(np.float32), axis=1)
     height, width = now.shape
-    at = there.reshape(-1, 2).astype(np.float64)
+    at = there.astype(np.float64)
     inside = (at > 1.0).all(1) & (at[:, 0] < width - 2.0) & (at[:, 1] < height - 2.0)
-    return at, (found.ravel() == 1) & (again.ravel() == 1) & (off < _BACK_PX) & inside
+    return at, found & again & (off < _BACK_PX) & inside, residual
 
 
-def repeated(before: Grey, now: Grey, pixels: Array, there: Array, elsewhere: Array) -> np.ndarray:
+def repeated(
+    before: Grey, now: Grey, pixels: Array, there: Array, elsewhere: Array, residual: Array
+) -> np.ndarray:  # fmt: skip
     """Which corners ``(n,)`` that were followed look alike elsewhere: of these, what was found is what was expected.
 
     The search back begins ``elsewhere`` ``(n, 2)``. It ends at another place than where the corner was, and fits there
-    by less than four times the residual (mean grey levels of a pixel; one at least) of the right place.
+    by less than four times the ``residual`` ``(n,)`` of the right place (one grey level at least).
     """
     if len(pixels) == 0:
         return np.zeros(0, bool)
-    start, right, wrong = (np.ascontiguousarray(at, np.float32).reshape(-1, 1, 2) for at in (there, pixels, elsewhere))
-    (_, _, known), (back, again, residual) = (
-        cv2.calcOpticalFlowPyrLK(now, before, start, hint, None, None, _WINDOW, 1, _STOP, cv2.OPTFLOW_USE_INITIAL_FLOW)
-        for hint in (right, wrong)
+    back, again, other = _flow(now, before, there, elsewhere, 1)
+    moved = np.linalg.norm(back - pixels, axis=1) >= _BACK_PX
+    alike: np.ndarray = other < _ALIKE * np.maximum(residual, 1.0)
+    return again & moved & alike
+
+
+def _flow(before: Grey, now: Grey, pixels: Array, guess: Array, levels: int) -> tuple[Array, np.ndarray, Array]:
+    """Where points ``(n, 2)`` are in the other picture, which were found, and the residuals, from a ``guess``."""
+    start, hint = (np.ascontiguousarray(at, np.float32).reshape(-1, 1, 2) for at in (pixels, guess))
+    there, found, residual = cv2.calcOpticalFlowPyrLK(
+        before, now, start, hint.copy(), None, None, _WINDOW, levels, _STOP, cv2.OPTFLOW_USE_INITIAL_FLOW
     )
-    other = np.linalg.norm(back.reshape(-1, 2) - pixels, axis=1) >= _BACK_PX
-    alike: np.ndarray = residual.ravel() < _ALIKE * np.maximum(known.ravel(), 1.0)
-    return (again.ravel() == 1) & other & alike
+    return there.reshape(-1, 2), found.ravel() == 1, residual.ravel()
 
 
 def corners(grey: Grey, most: int, apart_px: float, taken: Array) -> Array:

@@ -128,13 +128,13 @@ class TrackedOdometry:
         guess, ahead = self._model.pixels(base_vectors(self._points, predicted, self._centre_now))
         size = grey.shape[::-1]
         near = ahead & (guess > 0.0).all(1) & (guess < size).all(1)
-        at, found = followed(self._grey, grey, self._pixels, np.where(near[:, None], guess, self._pixels))
+        at, found, residual = followed(self._grey, grey, self._pixels, np.where(near[:, None], guess, self._pixels))
         given = between(self.pose, predicted)
         std = math.sqrt(self._turn_variance(math.hypot(given[0], given[1]), abs(given[2]), 1))
         turned, _ = self._model.pixels(base_vectors(self._points, predicted + (0.0, 0.0, _OFF * std), self._centre_now))
         either_way = np.where(np.arange(len(at)) % 2, 1.0, -1.0)[:, None]
         elsewhere = self._pixels + either_way * np.where(near[:, None], turned - guess, 0.0)
-        self._sure = ~repeated(self._grey, grey, self._pixels, at, elsewhere)[found & near]
+        self._sure = ~repeated(self._grey, grey, self._pixels, at, elsewhere, residual)[found & near]
         self._keep(found & near, at)
 
     def _turn_variance(self, way: float, turn: float, frames: float) -> float:

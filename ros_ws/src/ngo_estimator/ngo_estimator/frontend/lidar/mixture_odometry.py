@@ -254,27 +254,33 @@ class MixtureOdometry:
         points = few.points
         if not len(points):
             return None
-        weight, starts, usual = self._weight(points), self._starts(), self._usual or _FIRST_USUAL
+        weight, starts = self._weight(points), self._starts()
         for reach in (LIKELY, ANYWHERE, EVERYWHERE):
-            prior = self._prior(None, reach == EVERYWHERE)
-            fits = [self._fit(few, k, None, weight, reach == EVERYWHERE) for k in starts]
+            wide = reach == EVERYWHERE
+            if reach != ANYWHERE:  # there only the window of the search is another one
+                prior, begun = self._prior(None, wide), [self._fit(few, k, None, weight, wide) for k in starts]
+            fits = begun.copy()
             for pose, _ in two_modes(
                 self._submap.field, points, self._window(prior, reach), prior, weight,
                 (config.apart_m, math.radians(config.apart_deg)), config.margin * weight,
             ):  # fmt: skip
                 if not any(self._is_same(pose, other.pose) for other in fits):
-                    fit = self._fit(few, ANY, pose, weight, reach == EVERYWHERE)
+                    fit = self._fit(few, ANY, pose, weight, wide)
                     fits.append(replace(fit, total=fit.total - config.noise * weight))
             fits.sort(key=lambda fit: -fit.total)
             best = fits[0]
             enough = reach != LIKELY or self.mixture.trusts_wheels
-            if best.score >= config.new_share * usual or (enough and self._fits(points, best.pose)):
+            if best.score >= config.new_share * self._expected_score or (enough and self._fits(points, best.pose)):
                 return self._doubted([self._sharpened(scan, few, best), *fits[1:]], weight)
         return None
 
+    @property
+    def _expected_score(self) -> float:
+        return self._usual or _FIRST_USUAL
+
     def _fits(self, points: Array, pose: Array) -> bool:
         """Whether those of the points that lie where something was seen fit; few contradict nothing."""
-        least = self.config.lost_share * (self._usual or _FIRST_USUAL)
+        least = self.config.lost_share * self._expected_score
         known = self._submap.field.scores(points, pose[None], least)[0]
         return len(points) < _FEWEST or bool(known > least + 1e-6)  # rounding
 

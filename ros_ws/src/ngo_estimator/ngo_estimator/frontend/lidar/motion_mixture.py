@@ -64,7 +64,6 @@ class MotionMixture:
         self._factors = np.array(config.first_factors)[:, None].repeat(2, axis=1)  # of positions, of headings
         self._squares, self._least = self._factors**2, np.array(config.least_factors)
         self._steps = np.zeros((6, 3))
-        self._asked = self._weights > 0.0
         self._usable = np.zeros(6, np.bool_)
         self._base = self._deviations = np.ones((6, 2))
         self._gap, self._yaw = 1.0, 0.0
@@ -101,7 +100,7 @@ class MotionMixture:
         ``gap`` is the time since the last scan in usual periods: what the wheels did not count is as much longer.
         """
         heard = by_wheels is not None
-        self._usable[:] = self._asked & np.array((heard, heard, True, True, True, True))
+        self._usable[:] = (self._weights > 0.0) & np.array((heard, heard, True, True, True, True))
         self._steps[:] = 0.0
         self._last_gap, self._gap = self._gap, min(max(gap, 0.05), self._config.most_gap)
         self._steps[LAST] = self._steps[ANY] = arc_motion(self.filter.velocity, self._last_gap)
