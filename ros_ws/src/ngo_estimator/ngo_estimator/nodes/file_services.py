@@ -72,23 +72,21 @@ class FileServices:
     async def _on_save_trajectory(
         self, request: SaveTrajectory.Request, response: SaveTrajectory.Response
     ) -> SaveTrajectory.Response:
-        trajectories, folder = self._trajectories(), self._folder
         graph = self._graph() if request.path.endswith(GRAPH_ENDING) else None
-        write = partial(_write, trajectories=trajectories, graph=graph)
-        response.success, response.message = await self._aside(lambda: _written(request.path, folder, write))
-        self._keep_names(response.success, graph)
+        response.success, response.message = await self._save(request.path, _write, graph)
         return response
 
     async def _on_save_graph(self, request: SaveGraph.Request, response: SaveGraph.Response) -> SaveGraph.Response:
-        graph = self._graph()
-        write = partial(_write_graph, trajectories=self._trajectories(), graph=graph)
-        response.success, response.message = await self._aside(lambda: _written(request.path, self._folder, write))
-        self._keep_names(response.success, graph)
+        response.success, response.message = await self._save(request.path, _write_graph, self._graph())
         return response
 
-    def _keep_names(self, success: bool, graph: "PlanarGraph | None") -> None:
+    async def _save(self, path: str, write: Callable[..., str], graph: "PlanarGraph | None") -> tuple[bool, str]:
+        """Whether a file was written, and a message; its graph, where it has one, names poses from then on."""
+        whole = partial(write, trajectories=self._trajectories(), graph=graph)
+        success, message = await self._aside(lambda: _written(path, self._folder, whole))
         if success and graph is not None:
             self.written = graph.stamps_ns, graph.ranks
+        return success, message
 
     async def _aside(self, work: Callable[[], Result]) -> Result:
         """The result of work that is done in a thread, or its error."""
