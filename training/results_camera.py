@@ -27,6 +27,7 @@ from ngo_sim import episodes, maze3d
 from training.common import records
 from training.common.command_line import check_at_least, run_command
 from training.data.doom_drives import TEST_MAPS, VALIDATION_MAPS
+from training.report.folders import with_earlier
 from training.scoring import camera_rows
 from training.scoring.camera_rows import Ablation, camera_drive, measured
 from training.scoring.table import Drive, Numbers, Row, Rows, interval_of, measure
@@ -73,8 +74,9 @@ def main(arguments: Arguments) -> dict[str, Any]:
     split = "" if arguments.split == "test" else f".{arguments.split}"
     ablation = "" if arguments.without == "nothing" else f".no_{arguments.without}"
     path = arguments.results / f"camera{split}{ablation}.json"
-    if path.is_file():
-        drives = _with_published(drives, json.loads(path.read_text()), arguments.frames)
+    published = json.loads(path.read_text()) if path.is_file() else None
+    if published is not None and published["arguments"]["frames"] == arguments.frames:
+        drives = with_earlier(drives, published["drives"], published["revision"])
     result = {
         **records.record("results_camera", arguments),
         "odometry": asdict(CameraConfig()),
@@ -87,13 +89,6 @@ def main(arguments: Arguments) -> dict[str, Any]:
     for name, numbers in {**drives, f"median, {len(drives)} drives": result["median"]}.items():
         print(name, {key: value if key == "revision" else round(value, 3) for key, value in numbers.items()})
     return result
-
-
-def _with_published(drives: _Drives, published: dict[str, Any], frames: int) -> _Drives:
-    """What is ``published`` of drives of so many frames, with its revision, below what today's code has measured."""
-    if published["arguments"]["frames"] != frames:
-        return drives
-    return {name: {"revision": published["revision"], **of} for name, of in published["drives"].items()} | drives
 
 
 def _drives(arguments: Arguments) -> list[Drive]:

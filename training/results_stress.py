@@ -22,7 +22,7 @@ from training.common.command_line import run_command
 from training.data.lidar_changes import CHANGES, UNSEEDED
 from training.recordings.lidar_logs import logs_below, relations_of
 from training.report import stress_page
-from training.report.folders import Folders
+from training.report.folders import Folders, with_earlier
 from training.scoring import stress_tables
 from training.scoring.lidar_bars import stress_bars
 from training.scoring.lidar_rows import FRONT_ABLATION, ROWS
@@ -89,9 +89,9 @@ def main(arguments: Arguments) -> dict[str, Any]:
     logs = {} if arguments.logs is None else _logs(arguments, rows, asked)
     tables = {name: _simulated(arguments, name, table, asked) for name, table in _tables(arguments).items()}
     if earlier := arguments.published("stress"):
-        logs = with_earlier(logs, earlier["logs"], earlier["revision"])
+        logs = tables_with_earlier(logs, earlier["logs"], earlier["revision"])
         if earlier["settings"] == {name: getattr(arguments, name) for name in earlier["settings"]}:
-            tables = with_earlier(tables, earlier["tables"], earlier["revision"])
+            tables = tables_with_earlier(tables, earlier["tables"], earlier["revision"])
     result = {
         "command": 'make results WORLD=stress ARGS="--logs FOLDER"',
         "revision": record["revision"],
@@ -104,14 +104,15 @@ def main(arguments: Arguments) -> dict[str, Any]:
     return arguments.publish("stress", result, stress_page.page(result))
 
 
-def with_earlier(tables: Mapping[str, Any], published: Mapping[str, Any], revision: str) -> dict[str, Any]:
+def tables_with_earlier(tables: Mapping[str, Any], published: Mapping[str, Any], revision: str) -> dict[str, Any]:
     """``TABLE.CHANGE.ROW`` with what is ``published`` and not measured anew; such a cell names its ``revision``."""
     result: dict[str, Any] = {}
     for table in dict.fromkeys((*tables, *published)):
         old, new = published.get(table, {}), tables.get(table, {})
         result[table] = {
-            change: {row: {"revision": revision, **old[change][row]} for row in old.get(change, {}) if row in _ROWS}
-            | new.get(change, {})
+            change: with_earlier(
+                new.get(change, {}), {row: old[change][row] for row in old.get(change, {}) if row in _ROWS}, revision
+            )
             for change in dict.fromkeys((*CHANGES, *old, *new))
             if change in old or change in new
         }

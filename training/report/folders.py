@@ -1,6 +1,7 @@
 """The folders that every command of a table takes, and what it writes there."""
 
 import json
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -33,3 +34,8 @@ class Folders:
         write_at_once(self.out / f"{name}.json", json.dumps(result, indent=2) + "\n")
         write_at_once(self.docs / f"results_{name}.md", page)
         return result
+
+
+def with_earlier(cells: Mapping[str, Any], published: Mapping[str, Any], revision: str) -> dict[str, Any]:
+    """``cells`` by name, and those that are ``published`` and not measured anew, which name their ``revision``."""
+    return {name: {"revision": revision, **cell} for name, cell in published.items()} | dict(cells)

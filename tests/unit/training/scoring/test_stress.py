@@ -9,7 +9,7 @@ import pytest
 
 from ngo_estimator.geometry.planar_motion import all_between, compose
 from training.data.lidar_drives import Relations
-from training.results_stress import with_earlier
+from training.results_stress import tables_with_earlier
 from training.scoring import stress_cells
 from training.scoring.lidar_bars import stress_bars
 from training.scoring.lidar_rows import DriveRuns, Estimate, Row
@@ -61,11 +61,11 @@ def test_the_best_possible_is_the_clean_solution_between_the_scans_that_were_kep
 def test_cells_that_are_published_stay_until_they_are_measured_anew() -> None:
     published = {"aces": {"clean": {"ours": {"m": 2.0}, "kiss_icp": {"m": 3.0}}, "people": {"ours": {"m": 4.0}}}}
     measured = {"aces": {"clean": {"ours": {"m": 1.0}}}, "csail": {"clean": {"ours": {"m": 5.0}}}}
-    found = with_earlier(measured, published, "old")
+    found = tables_with_earlier(measured, published, "old")
     assert found["aces"]["clean"] == {"ours": {"m": 1.0}, "kiss_icp": {"revision": "old", "m": 3.0}}
     assert found["aces"]["people"] == {"ours": {"revision": "old", "m": 4.0}}
     assert found["csail"] == {"clean": {"ours": {"m": 5.0}}}
-    assert with_earlier({}, found, "new")["aces"]["clean"]["kiss_icp"]["revision"] == "old"
+    assert tables_with_earlier({}, found, "new")["aces"]["clean"]["kiss_icp"]["revision"] == "old"
 
 
 def flaser(k: int) -> str:
