@@ -1,21 +1,23 @@
 """Loop closures: the record of loops, and the search for them in whole trajectories.
 
-A loop says where a meta-pose lies relative to an earlier
-frame.
+A loop says where a meta-pose lies relative to an earlier frame.
 """
 
 from __future__ import annotations
 
 import dataclasses
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
 
+import numpy as np
 import torch
 from torch import Tensor
 
 from ngo_estimator.geometry import se2
 from ngo_estimator.geometry.scan_registration import Scans
+from ngo_estimator.geometry.se2 import library
 from ngo_estimator.graph.gauss_newton import pick
 from ngo_estimator.loops.pair_measurement import VIEWS, PairViews, measure_pairs
 from ngo_estimator.loops.place_ambiguity import looks_like_everything, places_by_odometry
@@ -87,6 +89,8 @@ class Loops:
     ``length`` ``(batch, loops)`` counts the meta-poses on a loop, where those between its ends stand for several each;
     ``most_drift`` ``(batch, loops, 3)`` is how far at most its residual varies by what is known without it. ``scans``
     are the frames' ranges, where overlaps are still to be looked for.
+
+    Of a single trajectory they may be arrays without the batch in front: see ``of_single``.
     """
 
     start: Tensor
@@ -116,22 +120,29 @@ class Loops:
             raise ValueError(f"loops have {sorted(mine)}, others {sorted(theirs)}; expected the same fields")
         return self._with({name: torch.cat((value, theirs[name]), dim=1) for name, value in mine.items()})
 
+    def of_single(self, which: np.ndarray | slice = slice(None)) -> Loops:
+        """Those of the only trajectory, of these indices, as arrays ``(loops, ...)``."""
+        return self._with({name: value[0].numpy()[which] for name, value in self._per_loop().items()})
+
     def _per_loop(self) -> dict[str, Tensor]:
         return {name: value for name in _PER_LOOP if (value := getattr(self, name)) is not None}
 
-    def _with(self, per_loop: dict[str, Tensor]) -> Loops:
+    def _with(self, per_loop: Mapping[str, Tensor | np.ndarray]) -> Loops:
         return dataclasses.replace(self, **per_loop)  # type: ignore[arg-type]
 
     @cached_property
     def log_length(self) -> Tensor:
         """Logarithm of how many meta-poses lie on each loop ``(batch, loops)``."""
         length = self.end - self.start + 1 if self.length is None else self.length
-        return torch.log(length.to(self.measured.dtype))
+        of = library(self.measured)
+        logarithm: Tensor = of.log(of.asarray(length, dtype=self.measured.dtype))
+        return logarithm
 
     @cached_property
     def nodes(self) -> Tensor:
         """The two poses of each loop ``(batch, loops, 2)``, as indices of the meta-poses with the origin in front."""
-        return torch.stack((self.start, self.end + 1), dim=-1)
+        nodes: Tensor = library(self.start).stack((self.start, self.end + 1), axis=-1)
+        return nodes
 
 
 def find_loops(pair_head: PairHead, codes: Tensor, in_blocks: Tensor, search: LoopSearch) -> Loops:

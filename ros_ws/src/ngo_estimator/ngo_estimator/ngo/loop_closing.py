@@ -15,7 +15,6 @@ from ngo_estimator.geometry.se2 import Values, library
 from ngo_estimator.graph.gauss_newton import chain_nodes, gauss_newton_step, pick, relative_factors
 from ngo_estimator.loops.loop_closure import Loops
 from ngo_estimator.ngo.loop_gates import (
-    JudgedLoops,
     RobustLoopGate,
     chained,
     is_single,
@@ -23,7 +22,7 @@ from ngo_estimator.ngo.loop_gates import (
     odometry_variances,
     unchained,
 )
-from ngo_estimator.ngo.meta_poses import BelievedLoops, GraphState, MetaSteps, Solution
+from ngo_estimator.ngo.meta_poses import GraphState, MetaSteps, OptimizedMetaPoses, Solution
 
 if TYPE_CHECKING:
     from ngo_estimator.graph.normal_equations import GraphStructure, NormalEquations
@@ -41,8 +40,6 @@ _LEAST_WEIGHT = 1e-4
 class NoLoopClosing:
     """Stands for ``LoopClosing`` in an optimizer without loops."""
 
-    closed = None
-
     def look(self, state: GraphState, iteration: int) -> None:
         """Nothing."""
 
@@ -53,6 +50,10 @@ class NoLoopClosing:
     def close(self, state: GraphState, stiffness: Tensor) -> GraphState:
         """The state as it is."""
         return state
+
+    def with_loops(self, result: OptimizedMetaPoses) -> OptimizedMetaPoses:
+        """The result as it is."""
+        return result
 
 
 class LoopClosing:
@@ -81,8 +82,7 @@ class LoopClosing:
         solution: Solution | None = None,
     ) -> None:
         self._keys, self._find_overlaps, self._correction_std = steps.key_frames, find_overlaps, correction_std
-        self._is_single = is_single(steps)
-        self._gate = gate.values(self._is_single)
+        self._gate, self._is_single = gate, is_single(steps)
         self._std, self._noise = self._given(steps.std), self._given(odometry_noise)
         self._new: np.ndarray | None = None
         self._weights: Any
@@ -100,14 +100,12 @@ class LoopClosing:
         self._structure: GraphStructure | None = None
         if self._new is not None and not len(self._new):
             return
-        self._judged: JudgedLoops[Any]
-        if not self._is_single:
-            self._judged = JudgedLoops.of(loops)
-        elif self._new is None:
-            self._judged = JudgedLoops.of_single(loops)
+        self._judged: Any = loops
+        if self._is_single and self._new is None:
+            self._judged = loops.of_single()
             self._shared = self._judged.valid
-        else:
-            self._judged = JudgedLoops.of_single(loops, self._new)
+        elif self._new is not None:
+            self._judged = loops.of_single(self._new)
 
     def _given(self, tensor: Tensor) -> Any:
         """Values of this batch, or arrays of the only trajectory."""
@@ -120,13 +118,17 @@ class LoopClosing:
         """Tensors of what ``_given`` gave."""
         return torch.from_numpy(values).unsqueeze(0) if self._is_single else values
 
-    @property
-    def closed(self) -> BelievedLoops:
-        """The loops of the last ``close``; raises ``RuntimeError`` before it."""
+    def with_loops(self, result: OptimizedMetaPoses) -> OptimizedMetaPoses:
+        """The result with the loops of the last ``close``; raises ``RuntimeError`` before it."""
         if not self._begun:
             raise RuntimeError("no iteration has closed loops yet; expected look() and close() before")
-        weights, information = self._returned(self._weights), self._returned(self._information)
-        return BelievedLoops(self._loops, weights, information, self._equations)
+        return replace(
+            result,
+            loops=self._loops,
+            loop_weights=self._returned(self._weights),
+            loop_information=self._returned(self._information),
+            equations=self._equations,
+        )
 
     def look(self, state: GraphState, iteration: int) -> None:
         """Judge the loops under the current poses; the third iteration adds overlaps to them."""

@@ -10,9 +10,7 @@ hundreds of calls on some hundred rows take torch four times as long as numpy.
 from __future__ import annotations
 
 import dataclasses
-from dataclasses import dataclass
-from functools import cached_property
-from typing import Any, Generic
+from typing import Any
 
 import numpy as np
 import torch
@@ -36,58 +34,6 @@ LEAST_STD = 0.01
 
 _LEAST_VARIANCE = 1e-12
 """Of the odometry between two poses, m^2 and rad^2, so that none divides by zero."""
-
-
-@dataclass(frozen=True)
-class JudgedLoops(Generic[Values]):
-    """What gates see of loops, ``(batch, loops, ...)`` or ``(loops, ...)``; fields as of ``Loops``."""
-
-    nodes: Values
-    measured: Values
-    log_scale: Values
-    spread: Values
-    logit: Values
-    similarity: Values
-    log_length: Values
-    valid: Values
-    most_drift: Values | None
-
-    @classmethod
-    def of(cls, loops: Loops) -> JudgedLoops[Tensor]:
-        """Those of a batch."""
-        names = (field.name for field in dataclasses.fields(JudgedLoops))
-        return JudgedLoops(**{name: getattr(loops, name) for name in names})
-
-    @classmethod
-    def of_single(cls, loops: Loops, which: np.ndarray | slice = slice(None)) -> JudgedLoops[np.ndarray]:
-        """Those of the only trajectory, of these indices."""
-
-        def of(values: Tensor) -> np.ndarray:
-            array: np.ndarray = values[0].numpy()[which]
-            return array
-
-        start, end = of(loops.start), of(loops.end)
-        length = end - start + 1 if loops.length is None else of(loops.length)
-        return JudgedLoops(
-            nodes=np.stack((start, end + 1), axis=-1),
-            measured=of(loops.measured),
-            log_scale=of(loops.log_scale),
-            spread=of(loops.spread),
-            logit=of(loops.logit),
-            similarity=of(loops.similarity),
-            log_length=np.log(length.astype(np.float32)),
-            valid=of(loops.valid),
-            most_drift=None if loops.most_drift is None else of(loops.most_drift),
-        )
-
-    @cached_property
-    def description(self) -> Values:
-        """What gates see of each loop under all poses ``(..., loops, 7)``."""
-        of = library(self.logit)
-        beliefs = of.stack((self.similarity, self.logit / 5.0), axis=-1)
-        length = self.log_length[..., None] / 3.0
-        seen: Values = of.concatenate((beliefs, self.log_scale, self.spread - self.log_scale, length), axis=-1)
-        return seen
 
 
 def is_single(steps: MetaSteps) -> bool:
@@ -214,54 +160,47 @@ class RobustLoopGate(nn.Module):
         nn.init.zeros_(self.head.weight)
         nn.init.zeros_(self.head.bias)
 
-    def values(self, single: bool) -> GateValues[Any]:
-        """What ``judged`` needs, as tensors or, for a ``single`` trajectory, as arrays."""
-        linear = [layer for layer in (*self.layers, self.head) if isinstance(layer, nn.Linear)]
-        tensors = [self.noise, self.components, self.merged, *(x for of in linear for x in (of.weight.T, of.bias))]
-        noise, components, merged, *layers = [x.detach().numpy() for x in tensors] if single else tensors
-        return GateValues(noise, components, merged, list(zip(layers[::2], layers[1::2], strict=True)))
-
-
-@dataclass(frozen=True)
-class GateValues(Generic[Values]):
-    """The values of a ``RobustLoopGate``; ``layers`` are weights, inputs first, and biases."""
-
-    noise: Values
-    components: Values
-    merged: Values
-    layers: list[tuple[Values, Values]]
-
     def judged(
-        self, loops: JudgedLoops[Values], residuals: Values, expected_variance: Values, iteration: int
+        self, loops: Loops, residuals: Values, expected_variance: Values, iteration: int
     ) -> tuple[Values, Values]:
         """Gate ``(..., loops)`` in zero to one, and information ``(..., loops, 3)`` of each loop.
 
         Args:
-            residuals: ``(..., loops, 3)``, float64 like ``expected_variance``.
+            residuals: ``(..., loops, 3)``, float64 like ``expected_variance``; arrays where ``loops`` are.
             expected_variance: what the odometry alone lets the residuals vary ``(..., loops, 3)``.
             iteration: how many iterations came before.
         """
-        of, annealing = library(residuals), RobustLoopGate.ANNEALING**iteration
+        of, annealing = library(residuals), self.ANNEALING**iteration
+        noise, components, merged = (_like(residuals, x) for x in (self.noise, self.components, self.merged))
         # Of position and heading; a position's error has two components.
-        variance = of.exp(2.0 * loops.log_scale) * self.noise
-        both = variance * self.components
-        errors, drift = (_times(x, self.merged) for x in (residuals**2, expected_variance))
+        variance = of.exp(2.0 * loops.log_scale) * noise
+        both = variance * components
+        errors, drift = (_times(x, merged) for x in (residuals**2, expected_variance))
         squared = (errors / (both + annealing * drift)).sum(-1)
+        beliefs = of.stack((loops.similarity, loops.logit / 5.0), axis=-1)
+        unlike, length = loops.spread - loops.log_scale, loops.log_length[..., None] / 3.0
         numbers = of.stack((of.log1p(squared), of.full_like(squared, annealing)), axis=-1)
-        seen = (loops.description, of.log1p(errors / both) / 3.0, numbers)
+        seen = (beliefs, loops.log_scale, unlike, length, of.log1p(errors / both) / 3.0, numbers)
         belief = self._network(of.concatenate(seen, axis=-1))
         sure = 0.5 + 0.5 * of.tanh(0.5 * loops.logit + 1.0 + 2.0 * belief[..., 0])  # the logistic function
-        gate = sure * loops.valid / (1.0 + squared / RobustLoopGate.WIDTH) ** 2
+        gate = sure * loops.valid / (1.0 + squared / self.WIDTH) ** 2
         information = gate[..., None] * of.exp(4.0 * of.tanh(belief[..., 1:] / 2.0)) / variance
         return gate, information[..., [0, 0, 1]]
 
     def _network(self, seen: Values) -> Values:
         """Belief and scales ``(..., loops, 3)`` of what describes loops ``(..., loops, 11)``."""
-        weight, bias = self.layers[0]
+        linear = [layer for layer in (*self.layers, self.head) if isinstance(layer, nn.Linear)]
+        layers = [(_like(seen, of.weight.T), _like(seen, of.bias)) for of in linear]
+        weight, bias = layers[0]
         hidden = _times(seen, weight) + bias
-        for weight, bias in self.layers[1:]:
+        for weight, bias in layers[1:]:
             hidden = hidden.clip(0.0) @ weight + bias  # ReLU
         return hidden
+
+
+def _like(values: Values, parameter: Tensor) -> Values:
+    """A parameter as a tensor, or as an array where ``values`` are one."""
+    return parameter.detach().numpy() if isinstance(values, np.ndarray) else parameter
 
 
 def _times(values: Values, matrix: Values) -> Values:

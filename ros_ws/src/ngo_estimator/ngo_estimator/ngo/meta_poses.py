@@ -85,21 +85,6 @@ class GraphState:
         return with_origin(se2.r2g(self.relative))
 
 
-@dataclass(frozen=True)
-class BelievedLoops:
-    """The loops of an iteration, and the belief in them.
-
-    ``weights`` ``(batch, loops)`` from zero to one, ``information`` ``(batch, loops, 3)`` (1/m^2, 1/m^2, 1/rad^2) along
-    the axes of the map, the same along x and y. ``equations`` are those of the Gauss-Newton step; None if a gradient
-    was asked for.
-    """
-
-    loops: Loops
-    weights: Tensor
-    information: Tensor
-    equations: NormalEquations | None
-
-
 class Solution(NamedTuple):
     """Where an earlier optimisation of one trajectory ended.
 
@@ -130,36 +115,23 @@ class OptimizedMetaPoses:
     """The optimizer's result for a batch of meta-steps.
 
     ``meta_relative``: one ``(batch, poses, 3)`` for each iteration, first to last. ``step_std`` ``(batch, poses, 3)``:
-    the deviations with which the odometry is believed. ``closed``: the loops of the last iteration, None before it and
-    for an optimizer without loops. ``corrections``: what the network gave in each iteration. ``left``: iterations to
-    come.
+    the deviations with which the odometry is believed. ``corrections``: what the network gave in each iteration.
+    ``left``: iterations to come.
+
+    After the last iteration of an optimizer with loops, ``loops`` are these, those found under corrected poses
+    included, with ``loop_weights`` ``(batch, loops)`` from zero to one, and ``loop_information`` ``(batch, loops, 3)``
+    (1/m^2, 1/m^2, 1/rad^2) along the axes of the map, the same along x and y. ``equations`` are those of the last
+    Gauss-Newton step, where no gradient was asked for.
     """
 
     meta_relative: list[Tensor]
     step_std: Tensor
-    closed: BelievedLoops | None
     corrections: list[Correction] = field(default_factory=list)
     left: int = 0
-
-    @property
-    def loops(self) -> Loops | None:
-        """The loops, those found under corrected poses included."""
-        return None if self.closed is None else self.closed.loops
-
-    @property
-    def loop_weights(self) -> Tensor | None:
-        """Belief in each loop ``(batch, loops)``, zero to one."""
-        return None if self.closed is None else self.closed.weights
-
-    @property
-    def loop_information(self) -> Tensor | None:
-        """Information of each loop ``(batch, loops, 3)``, along the axes of the map."""
-        return None if self.closed is None else self.closed.information
-
-    @property
-    def equations(self) -> NormalEquations | None:
-        """The normal equations of the last Gauss-Newton step, where no gradient was asked for."""
-        return None if self.closed is None else self.closed.equations
+    loops: Loops | None = None
+    loop_weights: Tensor | None = None
+    loop_information: Tensor | None = None
+    equations: NormalEquations | None = None
 
     def end_covariance(self) -> Tensor:
         """Covariance ``(batch, 3, 3)`` of the last meta-pose in the map (x, y, yaw), float64."""
@@ -168,8 +140,8 @@ class OptimizedMetaPoses:
             return torch.from_numpy(self.equations.covariance([self.step_std.shape[1]])).unsqueeze(0)
         poses = with_origin(se2.r2g(self.meta_relative[-1].double()))
         measured = [(chain_nodes(poses.shape[1] - 1).to(poses.device), step_information(self.step_std.double()))]
-        if self.closed is not None:
-            measured.append((self.closed.loops.nodes, self.closed.information.double()))
+        if self.loops is not None and self.loop_information is not None:
+            measured.append((self.loops.nodes, self.loop_information.double()))
         factors = [
             relative_factors(nodes, poses, torch.zeros_like(information), information)
             for nodes, information in measured

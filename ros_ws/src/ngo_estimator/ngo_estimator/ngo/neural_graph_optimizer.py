@@ -267,7 +267,8 @@ class NeuralGraphOptimizer(AttentionNetwork):
             state = closing.close(state, stiffness)
             results.append(state.relative.to(steps.relative.dtype))
             left = self.config.iterations - 1 - iteration
-            yield OptimizedMetaPoses(list(results), state.step_std, None if left else closing.closed, made, left)
+            result = OptimizedMetaPoses(list(results), state.step_std, made, left)
+            yield result if left else closing.with_loops(result)
 
     def _phases(
         self, steps: MetaSteps, loops: Loops | None, corrections: Sequence[Correction] | None

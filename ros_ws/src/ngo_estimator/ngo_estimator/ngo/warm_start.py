@@ -40,4 +40,4 @@ def resumed(
     adjusted[:, steps.key_frames :] += sum(adjustment for adjustment, _ in corrections)
     adjusted, stiffness = steps.without_fixed(steps.relative, adjusted, stiffness)
     relative, step_std = closing.resume(adjusted, stiffness, solution.relative, (0, iterations - 1))
-    yield OptimizedMetaPoses([relative.to(steps.relative.dtype)], step_std, closing.closed)
+    yield closing.with_loops(OptimizedMetaPoses([relative.to(steps.relative.dtype)], step_std))
