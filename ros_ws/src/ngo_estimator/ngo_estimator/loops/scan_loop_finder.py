@@ -22,7 +22,7 @@ from ngo_estimator.graph.sparsification import WALLS_M, largest_variances, neede
 from ngo_estimator.loops.key_scan_views import KeyScanViews
 from ngo_estimator.loops.scan_fit import fit
 from ngo_estimator.loops.scan_loop_agreement import with_agreement
-from ngo_estimator.loops.scan_loop_candidates import LoopCandidate, loop_candidates
+from ngo_estimator.loops.scan_loop_candidates import loop_candidates
 from ngo_estimator.loops.scan_loops import ScanLoops
 from ngo_estimator.loops.scan_settings import ScanGraphConfig
 from ngo_estimator.loops.scan_submaps import SUBMAP_VARIANCE, ScanSubmaps, laid_together
@@ -75,8 +75,8 @@ class ScanLoopFinder:
         if segments is not None and count - segments[-1] < config.source_keys:
             return np.zeros(0, np.int64)  # scans of two segments do not lie together
         loops = self.loops
-        for candidate in loop_candidates(config, self.views, poses, windows):
-            loop = self._verified(scans, poses, candidate, segments)
+        for place in loop_candidates(config, self.views, poses, windows):
+            loop = self._verified(scans, poses, place, windows[place], segments)
             if loop is not None:
                 loops = loops.extended(loop)
         if len(loops) == len(self.loops):
@@ -187,19 +187,23 @@ class ScanLoopFinder:
             require(named, f"loops are named that are not among the {len(pairs)}")
 
     def _verified(
-        self, scans: Sequence[KeyScan], poses: np.ndarray, candidate: LoopCandidate, segments: np.ndarray | None
+        self, scans: Sequence[KeyScan], poses: np.ndarray, place: int, likely: np.ndarray, segments: np.ndarray | None
     ) -> ScanLoops | None:
-        """A loop of the last key with the submap of a place, if it passes every test but that of its neighbours."""
+        """A loop of the last key with the submap of a place, if it passes every test but that of its neighbours.
+
+        The key is ``likely`` ``(3,)`` that near to its pose in the graph; it is searched somewhat farther.
+        """
         config, key = self.config.loops, len(scans) - 1
-        submap = self._submaps.around(candidate.place, scans, self.views.profiles, poses, segments)
+        submap = self._submaps.around(place, scans, self.views.profiles, poses, segments)
         first = max(0, key + 1 - config.source_keys)
         source = laid_together(scans[first:], self.views.profiles[first:], poses[first:])
-        found = fit(config, submap, source, candidate.centre, candidate.window)
+        expected = between(poses[place], poses[key])
+        found = fit(config, submap, source, expected, likely * (config.search_factor, config.search_factor, 1.0))
         if found is None:
             return None
-        off = found.pose - between(poses[candidate.place], poses[key])
+        off = found.pose - expected
         off[2] = wrap(off[2])
-        disagreement = float(np.linalg.norm(3.0 * off / candidate.likely))
+        disagreement = float(np.linalg.norm(3.0 * off / likely))
         if disagreement > config.most_disagreement:
             return None
         # From the nearest of the submap's keys: its pose in the submap is the least uncertain.
