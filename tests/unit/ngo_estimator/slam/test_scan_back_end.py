@@ -10,7 +10,6 @@ from ngo_estimator.data.state_arrays import StateError, restore, state_of
 from ngo_estimator.geometry.key_scan import KeyScan, no_scan
 from ngo_estimator.loops.scan_settings import ScanGraphConfig
 from ngo_estimator.slam.scan_back_end import ScanBackEnd
-from ngo_estimator.slam.step_log import TakenStep
 from tests.unit.ngo_estimator.loops.buildings import HALLWAY, TWICE, between, scan_at
 
 STEP, COVARIANCE = np.array((0.5, 0.0, 0.2)), np.diag((0.02**2, 0.03**2, 0.05**2))
@@ -31,7 +30,7 @@ def take(back_end: ScanBackEnd, step: RelativeStep) -> None:
     """Take a step, the first from the stamp 0, and do the work that it makes due."""
     if step.from_stamp_ns == 0:
         back_end.begin_at(step)
-    back_end.append(step, TakenStep(step.relative_xyyaw, step.covariance, step.from_stamp_ns == 0, False, False))
+    back_end.append(step)
     back_end.work()
 
 

@@ -13,7 +13,6 @@ from ngo_estimator.graph.pose_graph import PoseGraph
 from ngo_estimator.loops.loop_record import LoopRecord, rows
 from ngo_estimator.slam.localisation import Localiser
 from ngo_estimator.slam.map_origin import MapOrigin
-from ngo_estimator.slam.step_log import TakenStep
 from ngo_estimator.slam.trajectory_update import fault_of
 
 WhichLoops = Callable[[np.ndarray], np.ndarray]
@@ -73,8 +72,11 @@ class BackEnd(ABC):
         """Take what is known of the first frame, before the step from it."""
 
     @abstractmethod
-    def append(self, step: RelativeStep, taken: TakenStep) -> None:
-        """Take a step to the next frame, and the motion that the log of steps has of it."""
+    def append(self, step: RelativeStep, joins: bool = False) -> None:
+        """Take a step from the newest frame to the next one.
+
+        ``joins``: another odometry goes on from there, and the motion was found in the map.
+        """
 
     def newest(self) -> tuple[np.ndarray, np.ndarray]:
         """Pose ``(3,)`` of the newest frame in the map, and its covariance ``(3, 3)`` as it is published."""

@@ -16,7 +16,7 @@ from ngo_estimator.slam.bridge import bridged
 from ngo_estimator.slam.loop_report import LoopReport, loop_report
 from ngo_estimator.slam.map_localisation import MapLocalisation
 from ngo_estimator.slam.map_origin import MapOrigin
-from ngo_estimator.slam.step_log import StepLog, TakenStep
+from ngo_estimator.slam.step_log import StepLog
 from ngo_estimator.slam.trajectory_update import Trajectory, TrajectoryUpdate
 from ngo_estimator.trajectory.g2o import PlanarGraph, graph_of_frames
 
@@ -122,7 +122,7 @@ class CorrectedTrajectory(ABC):
         return self._fault
 
     def update(self, step: RelativeStep, optimize: bool = True) -> TrajectoryUpdate:
-        """Take the next step; see ``StepLog.take`` for gaps and new beginnings.
+        """Take the next step; see ``StepLog`` for gaps (``take``) and new beginnings (``is_restart``).
 
         Without ``optimize`` the newest frame follows the one before it by odometry alone. The next optimisation takes
         all of them in.
@@ -134,15 +134,16 @@ class CorrectedTrajectory(ABC):
         """
         step = self._back_end.checked(step)
         self._begin_result()
-        if self._loaded and self._log.is_restart(step):  # it would replace all that was loaded
+        restarted = self._log.is_restart(step)
+        if restarted and self._loaded:  # it would replace all that was loaded
             raise RejectedStep(
                 f"step to {step.stamp_ns} ns is of an odometry that began at {step.origin_stamp_ns} ns, or older than "
                 "the loaded trajectory; expected the odometry of that one to go on, or a reset"
             )
+        if restarted:
+            self.reset()
         taken = self._log.take(step)
-        if taken.restarted:
-            self._begin()
-        return self._take(step, taken, optimize)
+        return self._follow(taken, optimize, restarted=restarted, gap=taken is not step)
 
     def join(self, step: RelativeStep, pose_xyyaw: np.ndarray, covariance: np.ndarray) -> TrajectoryUpdate:
         """Go on with another odometry, from the frame that ``step`` ends at.
@@ -168,7 +169,7 @@ class CorrectedTrajectory(ABC):
         if not self.may_join(step):
             raise RejectedStep(f"step to {step.stamp_ns} ns has no key scan; expected one where an odometry begins")
         self._begin_result()
-        return self._take(step, self._log.join(step, relative, covariance), optimize)
+        return self._follow(self._log.join(step, relative, covariance), optimize, joins=True)
 
     def begins_anew(self, step: RelativeStep) -> bool:
         """Whether a step is of another odometry, so that ``update`` would forget this trajectory.
@@ -185,17 +186,20 @@ class CorrectedTrajectory(ABC):
         """Raise ``RejectedStep`` if a step of another odometry is not later than the newest frame."""
         self._log.check_later(step)
 
-    def _take(self, step: RelativeStep, taken: TakenStep, optimize: bool) -> TrajectoryUpdate:
+    def _follow(
+        self, step: RelativeStep, optimize: bool, *, restarted: bool = False, gap: bool = False, joins: bool = False
+    ) -> TrajectoryUpdate:
+        """Let the newest frame follow by a step that the log has taken."""
         self._loaded = False
-        if taken.begins:
+        if self._log.steps == 1:
             self._back_end.begin_at(step)
             self._online.append(np.zeros(3))
-        self._back_end.append(step, taken)
+        self._back_end.append(step, joins)
         self._odom = step.tf_odom_xyyaw
         self._due, self._optimize = True, optimize
         if not self._answers_first:
             self._work()
-        update = self._result(taken.restarted, taken.gap)
+        update = self._result(restarted, gap)
         self._online.append(update.pose_xyyaw)
         return update
 

@@ -55,11 +55,12 @@ class MapLocalisation:
     def update(self, step: RelativeStep) -> LocalisedStep:
         """Take the next step; raises ``RejectedStep`` for one that cannot be used. Everything is then as before."""
         step = self._checked(step)
+        restarted = self._log.is_restart(step)
+        if restarted:
+            self.reset()
         taken = self._log.take(step)
-        if taken.restarted:
-            self._localiser.reset()
-        found = self._localiser.update(step, taken.relative.astype(np.float64), bounded(taken.covariance))
+        found = self._localiser.update(step, taken.relative_xyyaw.astype(np.float64), bounded(taken.covariance))
         map_from_odom = None
         if found.pose_xyyaw is not None:
             map_from_odom = compose(found.pose_xyyaw, inverse(step.tf_odom_xyyaw))
-        return LocalisedStep(found, map_from_odom, taken.restarted, taken.gap)
+        return LocalisedStep(found, map_from_odom, restarted, taken is not step)

@@ -18,7 +18,6 @@ from ngo_estimator.slam.back_end import BackEnd, ClosedLoops, require_sound
 from ngo_estimator.slam.localisation import LocalisationConfig, Localiser
 from ngo_estimator.slam.map_origin import MapOrigin
 from ngo_estimator.slam.picture_matcher import PictureMatcher
-from ngo_estimator.slam.step_log import TakenStep
 
 _KEYS_PER_OPTIMISED = 20
 """For each so many nodes an optimisation waits for one more key picture."""
@@ -53,9 +52,9 @@ class PictureBackEnd(BackEnd):
         code = step.from_place_code
         self._finder.append(nothing_seen() if code is None or not len(code) else KeyPicture.unpacked(code))
 
-    def append(self, step: RelativeStep, taken: TakenStep) -> None:
+    def append(self, step: RelativeStep, joins: bool = False) -> None:
         """Take a step; where it ends at a key picture, that is a node."""
-        self.graph.append(taken.relative, bounded(taken.covariance), taken.joins)
+        self.graph.append(step.relative_xyyaw, bounded(step.covariance), joins)
         if len(step.place_code):
             self.graph.add_node(bounded(self.graph.since_covariance))
             self._finder.append(KeyPicture.unpacked(step.place_code))

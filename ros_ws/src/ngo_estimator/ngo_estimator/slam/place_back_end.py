@@ -28,7 +28,7 @@ from ngo_estimator.slam.map_origin import MapOrigin
 from ngo_estimator.slam.network_corrections import NetworkCorrections
 from ngo_estimator.slam.odometry_blocks import OdometryBlocks
 from ngo_estimator.slam.place_matcher import PlaceMatcher
-from ngo_estimator.slam.step_log import StepLog, TakenStep
+from ngo_estimator.slam.step_log import StepLog
 
 _VARIANCES = (1e-12, 1e4)
 """What lies below or above is exact or unknown, and float32 has no room for it."""
@@ -96,20 +96,21 @@ class PlaceBackEnd(BackEnd):
         if self._pair_head is not None and step.from_place_code is not None:
             self._origin_code = step.from_place_code
 
-    def append(self, step: RelativeStep, taken: TakenStep) -> None:
+    def append(self, step: RelativeStep, joins: bool = False) -> None:
         """Take a step with its motion feature and place code.
 
         An unfamiliar frame closes no loops, and networks leave the odometry around it as it is. Its variances are
         honest, so that ``covariance_scale`` is not for them. The first one recalls those before it.
         """
-        variance, code = np.clip(np.diagonal(taken.covariance), *_VARIANCES), step.place_code
+        variance, code = np.clip(np.diagonal(step.covariance), *_VARIANCES), step.place_code
         familiar = step.unlikeness <= UNFAMILIAR
         if not familiar:
             code, variance = np.zeros_like(code), variance / self._scale
             if self._odometry.is_familiar:
                 self._recall()
-        self.graph.append(taken.relative.astype(np.float64), np.diag(variance.astype(np.float64)), taken.joins)
-        self._odometry.append(taken.relative, variance, step.motion_feature, familiar)
+        relative = step.relative_xyyaw
+        self.graph.append(relative.astype(np.float64), np.diag(variance.astype(np.float64)), joins)
+        self._odometry.append(relative, variance, step.motion_feature, familiar)
         if self._finder is not None:
             self._finder.append(code)
 

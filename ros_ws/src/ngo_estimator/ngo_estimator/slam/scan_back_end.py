@@ -30,7 +30,6 @@ from ngo_estimator.slam.localisation import Localiser
 from ngo_estimator.slam.map_origin import MapOrigin
 from ngo_estimator.slam.own_map import OwnMap
 from ngo_estimator.slam.scan_matcher import ScanMatcher
-from ngo_estimator.slam.step_log import TakenStep
 
 _KEYS_PER_OPTIMISED = 20
 """For each so many nodes an optimisation waits for one more key scan."""
@@ -86,19 +85,19 @@ class ScanBackEnd(BackEnd):
         """Take the first frame. Where its scan is missing, it adds no points to submaps."""
         self._scans.append(no_scan(step.from_stamp_ns) if step.origin_scan is None else step.origin_scan)
 
-    def append(self, step: RelativeStep, taken: TakenStep) -> None:
+    def append(self, step: RelativeStep, joins: bool = False) -> None:
         """Take a step, with its key scan where there is one.
 
         Where another odometry goes on in another place, it ends at a key scan. Where it begins a segment, nobody
         measured it: it tells where the robot is taken to be until a loop does.
         """
-        covariance = bounded(taken.covariance)
+        covariance = bounded(step.covariance)
         if step.segment:
             covariance = OPEN
             self.graph.open_segment()
-        self.graph.append(taken.relative, covariance, taken.joins or step.segment)
+        self.graph.append(step.relative_xyyaw, covariance, joins or step.segment)
         if step.key is not None:
-            self._add_key(step.key, taken.joins)
+            self._add_key(step.key, joins)
             self._own_map.follow(self.graph)
             self._scans.append(step.key.scan)
             self._is_key = True

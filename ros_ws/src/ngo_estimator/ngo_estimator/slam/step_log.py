@@ -1,7 +1,7 @@
 """The steps of a trajectory in their order: stamps, odometry, gaps and new beginnings."""
 
 import math
-from dataclasses import dataclass
+from dataclasses import replace
 
 import numpy as np
 
@@ -16,23 +16,6 @@ from ngo_estimator.data.relative_step import (
 from ngo_estimator.data.row_buffers import GrowingRows
 from ngo_estimator.data.state_arrays import require
 from ngo_estimator.geometry.se2 import between, compose, inverse
-
-
-@dataclass(frozen=True)
-class TakenStep:
-    """Motion from the newest frame to the next one.
-
-    ``relative`` (3,) and its ``covariance`` (3, 3). ``begins``: it is the first of a trajectory; ``restarted``: there
-    was another before. ``gap``: steps were lost, and the motion is composed from the odometry. ``joins``: another
-    odometry goes on from here, and the motion was found in the map.
-    """
-
-    relative: np.ndarray
-    covariance: np.ndarray
-    begins: bool
-    restarted: bool
-    gap: bool
-    joins: bool = False
 
 
 class StepLog:
@@ -65,7 +48,10 @@ class StepLog:
         return pose
 
     def is_restart(self, step: RelativeStep) -> bool:
-        """Whether a step comes from a source that started anew since the last one, or that went impossibly far."""
+        """Whether a step begins a new trajectory, for the motion since the last one is unknown.
+
+        Its odometry has another origin, or it lies ``RESTART_AFTER_NS`` or more in the past, or ``LARGEST_VALUE`` away.
+        """
         if self.steps == 0:
             return False
         last = int(self.stamps_ns.values[-1])
@@ -75,41 +61,37 @@ class StepLog:
         over_gap = step.stamp_ns > last != step.from_stamp_ns
         return over_gap and bool(np.abs(self._over_gap(step, last)[0]).max() > LARGEST_VALUE)
 
-    def take(self, step: RelativeStep) -> TakenStep:
-        """Take the next step, which has been checked.
+    def take(self, step: RelativeStep) -> RelativeStep:
+        """Take the next step, which has been checked; after a restart a ``reset`` goes before.
 
         A step that begins after the last frame means lost steps: the motion between is composed from the poses in
-        ``odom``. A step of an odometry with another origin begins a new trajectory, for the motion between is unknown.
-        So does one that lies ``RESTART_AFTER_NS`` or more in the past, or ``LARGEST_VALUE`` away.
+        ``odom``.
+
+        Returns:
+            The step; another one, with the motion from the last frame, where steps were lost.
 
         Raises:
             DuplicateStep, LateStep: it is not newer than the last one. Nothing has changed.
         """
-        restarted, gap = False, False
-        relative, covariance = step.relative_xyyaw, step.covariance
-        if self.steps:
-            last = int(self.stamps_ns.values[-1])
-            if self.is_restart(step):
-                restarted = True
-            elif step.stamp_ns <= last:
-                kind = DuplicateStep if step.stamp_ns == last else LateStep
-                raise kind(f"step to {step.stamp_ns} ns came when the trajectory was at {last} ns already")
-            elif step.from_stamp_ns != last:
-                gap = True
-                relative, covariance = self._over_gap(step, last)
-        if restarted:
-            self.reset()
-        begins = self.steps == 0
-        if begins:
+        if self.steps == 0:
             self._begin(step)
-        self._append(step.stamp_ns, self._laid(step.odom_xyyaw), covariance)
-        return TakenStep(relative, covariance, begins, restarted, gap)
+        elif step.stamp_ns <= (last := int(self.stamps_ns.values[-1])):
+            kind = DuplicateStep if step.stamp_ns == last else LateStep
+            raise kind(f"step to {step.stamp_ns} ns came when the trajectory was at {last} ns already")
+        elif step.from_stamp_ns != last:
+            relative, covariance = self._over_gap(step, last)
+            step = replace(step, relative_xyyaw=relative, covariance=covariance)
+        self._append(step.stamp_ns, self._laid(step.odom_xyyaw), step.covariance)
+        return step
 
-    def join(self, step: RelativeStep, relative: np.ndarray, covariance: np.ndarray) -> TakenStep:
+    def join(self, step: RelativeStep, relative: np.ndarray, covariance: np.ndarray) -> RelativeStep:
         """Take the frame that a step of another odometry ends at, and go on with that odometry.
 
         Args:
             relative: ``(3,)`` pose of the frame, seen from the newest one; covariance: ``(3, 3)`` of it.
+
+        Returns:
+            The step with this motion.
 
         Raises:
             LateStep: it is not newer than the last one. Nothing has changed.
@@ -119,7 +101,7 @@ class StepLog:
         self._moved = compose(laid, inverse(step.odom_xyyaw))
         self._origin_stamp_ns, self._fresh = step.origin_stamp_ns, False
         self._append(step.stamp_ns, laid, covariance)
-        return TakenStep(relative, covariance, begins=False, restarted=False, gap=False, joins=True)
+        return replace(step, relative_xyyaw=relative, covariance=covariance)
 
     def begin_stream(self, present: int) -> None:
         """Let the next step, which ``join`` takes, begin another stream than that of the rank ``present``."""
