@@ -35,7 +35,7 @@ from training.data.data_source import Domain
 from training.data.episodes import images_of, simulate
 from training.data.streams import PairStream
 from training.data.worlds import OPTIMIZER_TRAIN_SEEDS, TRAIN_SEEDS, VALIDATION_SEEDS, World
-from training.recordings.recording_source import SourceArguments, open_source, told_to
+from training.recordings.recording_source import SourceArguments, inputs_of, open_source
 from training.recordings.recording_streams import RecordedSteps
 
 RPE_STEPS = 100
@@ -135,11 +135,10 @@ def stretch_losses(network: LocalPoseNetwork, batch: Batch, windows: tuple[int, 
     """
     estimates = network.estimates(batch["earlier"], batch["later"], batch.get("action"), batch.get("twist"))
     truth, std = batch["relative"], network.relative_std
-    pose_loss, likelihood = step_losses(estimates.visual.mean, estimates.visual.log_std, truth, std)
+    pose_loss, likelihood = step_losses(*estimates.visual, truth, std)
     if estimates.fused is estimates.visual:
         return pose_loss, likelihood
-    fused = (estimates.fused.mean, estimates.fused.log_std, truth)
-    mean, log_std, truth = (values.unflatten(0, (-1, max(windows))) for values in fused)
+    mean, log_std, truth = (values.unflatten(0, (-1, max(windows))) for values in (*estimates.fused, truth))
     of_fused = step_losses(mean, log_std, truth, std, windows)
     return pose_loss + of_fused[0], likelihood + of_fused[1]
 
@@ -228,7 +227,7 @@ def initial_network(
 ) -> tuple[LocalPoseNetwork, dict[str, str]]:
     """A fresh network or that of ``--from-weights``, and the entry of the JSON that names these weights.
 
-    Raises ``RecordingError`` where those weights take other images, or are told other things of a step.
+    Raises ``RecordingError`` where those weights take other images, or other control inputs.
     """
     wanted = domain.action_history if domain.actions else 1
     if arguments.recordings.from_weights is not None:
@@ -256,13 +255,13 @@ def _begun_network(folder: Path, domain: Domain, wanted: int) -> tuple[LocalPose
     config = network.config
     if (config.actions, config.twist) != (domain.actions, domain.twist):
         raise RecordingError(
-            f"{folder} takes {told_to(config)}, {domain.name} has {told_to(domain)}; expected the same "
+            f"{folder} takes {inputs_of(config)}, {domain.name} has {inputs_of(domain)}; expected the same "
             "(--action none, --twist none leave them out)"
         )
     if config.image != domain.image:
         raise RecordingError(f"{folder} takes {config.image}; expected {domain.image}")
     if config.action_history not in (1, wanted):
-        raise RecordingError(f"{folder} is told the latest {config.action_history} actions; expected 1 or {wanted}")
+        raise RecordingError(f"{folder} takes the latest {config.action_history} actions; expected 1 or {wanted}")
     # Calibrated they are anew; a memory was of the steps of these weights.
     changes: dict[str, Any] = {"deviation_scale": (1.0, 1.0, 1.0), "relative_bias": (0.0, 0.0, 0.0), "memory": None}
     if domain.mirrors:

@@ -35,8 +35,8 @@ class Domain:
     reverses: bool = False  # Whether the robot may drive backwards.
     actions: int = 3  # Number of discrete actions; 0: networks see images alone.
     mirrored_actions: tuple[int, ...] = MIRRORED_ACTIONS  # Mirror image of each action.
-    action_history: int = 1  # Number of latest actions that the local network is told.
-    twist: bool = False  # Whether networks are told the velocity of each step.
+    action_history: int = 1  # Number of latest actions that the local network takes.
+    twist: bool = False  # Whether networks take the velocity of each step.
     twist_scale: tuple[float, float, float] = (1.0, 1.0, 1.0)  # Velocity by which networks divide it (m/s, m/s, rad/s).
     mirrors: bool = True  # Whether the mirror image of a frame could be a frame.
     loops_per_pose: int = LoopSearch.per_pose  # Loop candidates of a meta-pose.

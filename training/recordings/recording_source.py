@@ -209,8 +209,8 @@ def check_same_data(data: RecordedData, local: TrainedLocal) -> None:
     config, domain = network.config, data.domain
     if (config.image, config.actions, config.twist) != (domain.image, domain.actions, domain.twist):
         raise RecordingError(
-            f"the local network of {domain.name} takes {config.image} and {told_to(config)}; these recordings give "
-            f"{domain.image} and {told_to(domain)}: {_ANEW}"
+            f"the local network of {domain.name} takes {config.image} and {inputs_of(config)}; these recordings give "
+            f"{domain.image} and {inputs_of(domain)}: {_ANEW}"
         )
     if description["training"]["arguments"]["data_sha256"] != data.sha256:
         raise RecordingError(
@@ -219,7 +219,7 @@ def check_same_data(data: RecordedData, local: TrainedLocal) -> None:
         )
 
 
-def told_to(network: Domain | LocalPoseConfig) -> str:
+def inputs_of(network: Domain | LocalPoseConfig) -> str:
     """The side information that a network takes of each step beside its two frames, in words."""
     return "actions" if network.actions else "velocities" if network.twist else "images alone"
 
@@ -332,8 +332,8 @@ def _print(data: RecordedData) -> None:
     made = f", made {image.reduction} times smaller" if image.reduction > 1 else ""
     made += f", {image.field_of_view_deg:g} deg" if image.field_of_view_deg is not None else ""
     print(f"frames: {size}{made}, one each {domain.period_s:.4f} s")
-    told = told_to(domain)
-    print(f"each step is estimated from the two frames and: {told}" if told != "images alone" else f"steps from {told}")
+    what = inputs_of(domain)
+    print(f"each step is estimated from the two frames and: {what}" if what != "images alone" else f"steps from {what}")
     print(f"places: within {domain.place_radius_m:.2f} m and {math.degrees(domain.heading_limit_rad):.0f} deg")
     print(
         f"left out by the projection to the plane: {residual['height_range_m']:.3f} m of height, tilt up to "

@@ -41,7 +41,7 @@ def side_information(track: Track, index: np.ndarray | slice) -> Batch:
 
 
 def known_side_information(domain: Domain, batch: Batch) -> Batch:
-    """A batch without what the domain's networks are not told."""
+    """A batch without the control inputs that the domain's networks do not take."""
     unknown = {name for name, used in (("action", domain.actions > 0), ("twist", domain.twist)) if not used}
     return {name: value for name, value in batch.items() if name not in unknown}
 

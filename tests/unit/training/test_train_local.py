@@ -181,7 +181,7 @@ def test_weights_to_begin_with_see_as_before_and_are_told_more(network: LocalPos
     ("changes", "message"),
     [
         ({"actions": 0}, "takes actions, maze2d has images alone"),
-        ({"action_history": 4}, "is told the latest 5 actions; expected 1 or 4"),
+        ({"action_history": 4}, "takes the latest 5 actions; expected 1 or 4"),
         ({"image": WORLDS["maze3d"].image}, "takes ImageFormat.*; expected ImageFormat"),
     ],
 )

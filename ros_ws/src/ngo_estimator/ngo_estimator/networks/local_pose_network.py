@@ -22,8 +22,8 @@ class LocalPoseConfig:
     deviation 1, and gives SI units. ``relative_bias`` (m, m, rad) is added to what it gives, in a symmetric network
     too, where means to the sides cancel: a robot may turn a little more one way than its mirror image would. ``width``
     scales the channels of FlowNetS; ``actions`` is the number of discrete actions, 0 for none, and ``action_history``
-    how many of the latest ones the network is told: in how a robot with momentum moves, what it did before goes on.
-    More than one of them pass through ``fusion_size`` hidden units. With ``twist`` the network is told the mean
+    how many of the latest ones the network takes: in how a robot with momentum moves, what it did before goes on.
+    More than one of them pass through ``fusion_size`` hidden units. With ``twist`` the network takes the mean
     velocity between the frames, which it divides by ``twist_scale`` (m/s, m/s, rad/s). ``period_s`` is the time between
     frames in training. With ``symmetric`` the estimate is the mean of that of the frames and that of their mirror
     images, in which action ``k`` becomes ``mirrored_actions[k]``. ``deviation_scale`` multiplies the standard
@@ -82,22 +82,15 @@ class LocalPoseConfig:
 
 
 @dataclass(frozen=True)
-class StepEstimate:
-    """Relative poses ``(batch, 3)`` (m, m, rad), ``mean``, and the logarithm of their standard deviations."""
-
-    mean: Tensor
-    log_std: Tensor
-
-
-@dataclass(frozen=True)
 class StepEstimates:
     """What a network makes of steps, ``fused``, and before its earlier actions are taken into account, ``visual``.
 
-    The two are one where it is told none. ``feature`` ``(batch, feature_size)`` is the motion feature.
+    Both are relative poses ``(batch, 3)`` (m, m, rad), and the logarithm of their standard deviations. The two are one
+    where it takes none. ``feature`` ``(batch, feature_size)`` is the motion feature.
     """
 
-    visual: StepEstimate
-    fused: StepEstimate
+    visual: tuple[Tensor, Tensor]
+    fused: tuple[Tensor, Tensor]
     feature: Tensor
 
 
@@ -107,9 +100,9 @@ class LocalPoseNetwork(nn.Module):
     Two frames are stacked and passed through the convolutions of FlowNetS; one fully connected layer takes these and
     the action or the velocity; a translational and a rotational head read it. Beyond the paper each head also gives the
     logarithm of its standard deviation, and the input of the heads is the motion feature that the pose aggregation
-    reads. A network that is told several of the latest actions corrects what the heads say: two layers see it, the
+    reads. A network that takes several of the latest actions corrects what the heads say: two layers see it, the
     feature and the actions. No gradient passes from there into the rest, which learns to see as if it knew nothing of
-    earlier actions: told at once, they explain so much that little is learned from the frames. A symmetric network
+    earlier actions: taken at once, they explain so much that little is learned from the frames. A symmetric network
     estimates both the frames and their mirror image, in evaluation mode: errors to the left and to the right then
     cancel wherever the two differ.
 
@@ -122,11 +115,11 @@ class LocalPoseNetwork(nn.Module):
         self.config = config
         image = config.image
         self.convolutions = FlowNetConvolutions(2 * image.channels, (image.height, image.width), config.width)
-        told = config.actions + 3 * config.twist
-        self.hidden = nn.Linear(self.convolutions.output_size + told, config.hidden_size)
+        controls = config.actions + 3 * config.twist
+        self.hidden = nn.Linear(self.convolutions.output_size + controls, config.hidden_size)
         self.feature = nn.Linear(config.hidden_size, config.feature_size)
-        self.translation = nn.Linear(config.feature_size + told, 4)
-        self.rotation = nn.Linear(config.feature_size + told, 2)
+        self.translation = nn.Linear(config.feature_size + controls, 4)
+        self.rotation = nn.Linear(config.feature_size + controls, 2)
         if config.action_history > 1:
             known = 6 + config.feature_size + config.actions * config.action_history + 3 * config.twist
             self.fusion = nn.Sequential(
@@ -171,15 +164,15 @@ class LocalPoseNetwork(nn.Module):
         actions = self._checked(actions, twist)
         if self.training or not self.config.symmetric:
             estimates = self._estimates(earlier, later, actions, twist)
-            return estimates.fused.mean + self.relative_bias, estimates.fused.log_std, estimates.feature
+            mean, log_std = estimates.fused
+            return mean + self.relative_bias, log_std, estimates.feature
         both = [torch.cat((frames, frames.flip(-2))) for frames in (earlier, later)]
         actions = actions if actions is None else torch.cat((actions, self.mirrored_actions[actions]))
         flip = self.relative_std.new_tensor([1.0, -1.0, -1.0])
         twist = twist if twist is None else torch.cat((twist, twist * flip))
         estimates = self._estimates(both[0], both[1], actions, twist)
-        of_both = (estimates.fused.mean, estimates.fused.log_std, estimates.feature)
-        mean, log_std, feature = (values.chunk(2) for values in of_both)
-        return 0.5 * (mean[0] + mean[1] * flip) + self.relative_bias, 0.5 * (log_std[0] + log_std[1]), feature[0]
+        means, log_stds, features = (values.chunk(2) for values in (*estimates.fused, estimates.feature))
+        return 0.5 * (means[0] + means[1] * flip) + self.relative_bias, 0.5 * (log_stds[0] + log_stds[1]), features[0]
 
     def remembered(self, relative: Tensor, log_std: Tensor, features: Tensor) -> tuple[Tensor, Tensor]:
         """Steps of drives and the logarithms of their deviations, ``(..., steps, 3)``, corrected by those before them.
@@ -224,18 +217,18 @@ class LocalPoseNetwork(nn.Module):
     def _estimates(self, earlier: Tensor, later: Tensor, actions: Tensor | None, twist: Tensor | None) -> StepEstimates:
         frames = torch.cat([to_network(frame, self.config.image) for frame in (earlier, later)], dim=1)
         inputs = [self.convolutions(frames)]
-        told, history = [], []
+        controls, history = [], []
         if actions is not None:
             # NO_ACTION becomes zeros.
             one_of_each = one_hot(actions - NO_ACTION, self.config.actions + 1)[..., 1:].to(frames.dtype)
-            told.append(one_of_each[:, -1])
+            controls.append(one_of_each[:, -1])
             history.append(one_of_each.flatten(1))
         if twist is not None:
-            told.append(twist.to(frames.dtype) / self.twist_scale)
-            history.append(told[-1])
-        hidden = torch.relu(self.hidden(torch.cat(inputs + told, dim=1)))
+            controls.append(twist.to(frames.dtype) / self.twist_scale)
+            history.append(controls[-1])
+        hidden = torch.relu(self.hidden(torch.cat(inputs + controls, dim=1)))
         feature = torch.relu(self.feature(hidden)).float()
-        heads_input = torch.cat([feature, *told], dim=1)
+        heads_input = torch.cat([feature, *controls], dim=1)
         translation, rotation = self.translation(heads_input).float(), self.rotation(heads_input).float()
         mean = torch.cat((translation[:, :2], rotation[:, :1]), dim=1)
         log_std = torch.cat((translation[:, 2:], rotation[:, 1:]), dim=1)
@@ -247,7 +240,7 @@ class LocalPoseNetwork(nn.Module):
             fused = self._in_units(corrected, corrected_log_std)
         return StepEstimates(visual, fused, feature)
 
-    def _in_units(self, mean: Tensor, log_std: Tensor) -> StepEstimate:
+    def _in_units(self, mean: Tensor, log_std: Tensor) -> tuple[Tensor, Tensor]:
         """Normalised relative poses and logarithms of their deviations ``(batch, 3)`` in SI units."""
         scale = self.relative_std.log() + self.log_deviation_scale
-        return StepEstimate(mean * self.relative_std + self.relative_mean, log_std.clamp(-7.0, 3.0) + scale)
+        return mean * self.relative_std + self.relative_mean, log_std.clamp(-7.0, 3.0) + scale

@@ -40,18 +40,6 @@ class Judged:
     repeated: bool
 
 
-@dataclass(frozen=True)
-class Told:
-    """What led to a step: action and mean velocity ``(3,)``, where the networks take them.
-
-    ``after_gap``: frames are missing before it, so that what was told earlier is of no account.
-    """
-
-    action: int | None
-    twist: np.ndarray | None = None
-    after_gap: bool = False
-
-
 class FamiliarityWatch:
     """The familiarity of one stream of observations.
 
@@ -89,7 +77,9 @@ class FamiliarityWatch:
         self,
         images: tuple[Tensor, Tensor],
         early: Tensor,
-        told: Sequence[Told],
+        actions: Sequence[int | None],
+        twists: Tensor | None,
+        after_gap: Sequence[bool],
         steps: tuple[Tensor, Tensor, Tensor],
     ) -> list[Judged]:
         """Judge the next ``n`` steps, in order.
@@ -97,18 +87,16 @@ class FamiliarityWatch:
         Args:
             images: the earlier and the later observation of each ``(n, height, width, channels)``.
             early: the place encoder's early features of the later ones.
-            told: what led to each.
+            actions, twists: what led to each, ``twists`` ``(n, 3)`` mean velocities, where the networks take them.
+            after_gap: whether frames are missing before each, so that earlier actions are of no account.
             steps: the network's motions ``(n, 3)``, variances ``(n, 3)`` and motion features ``(n, motion_size)``.
         """
         histories = []
-        for each in told:
-            before = [NO_ACTION] * HISTORY if each.after_gap else self._actions
-            self._actions = [*before[1:], NO_ACTION if each.action is None else each.action]
+        for action, gap in zip(actions, after_gap, strict=True):
+            before = [NO_ACTION] * HISTORY if gap else self._actions
+            self._actions = [*before[1:], NO_ACTION if action is None else action]
             histories.append(self._actions)
-        twists = (
-            torch.tensor(np.array([each.twist for each in told]), dtype=torch.float32) if self._config.twist else None
-        )
-        known = told_vector(self._config, torch.tensor(histories), twists, len(told))
+        known = told_vector(self._config, torch.tensor(histories), twists, len(histories))
         relative, variance, features = steps
         changed = change(*images)
         with torch.inference_mode():
@@ -128,11 +116,12 @@ class FamiliarityWatch:
         relative, variance, features = steps
         found = []
         for at in torch.arange(len(relative)).split(_CHUNK):
-            told = [Told(None if actions is None else int(actions[k])) for k in at.tolist()]
+            some = [None if actions is None else int(actions[k]) for k in at.tolist()]
             with torch.inference_mode():
                 early = self._encoder.early(images[at + 1])
             pairs = images[at], images[at + 1]
-            found += self.judge(pairs, early, told, (relative[at], variance[at], features[at]))
+            of_steps = relative[at], variance[at], features[at]
+            found += self.judge(pairs, early, some, None, [False] * len(some), of_steps)
         return found
 
     def _judged(

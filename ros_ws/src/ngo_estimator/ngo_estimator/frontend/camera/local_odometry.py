@@ -12,7 +12,7 @@ from ngo_estimator.checkpoint import PlaceNetworks, load_familiarity, load_local
 from ngo_estimator.data.images import ImageFormat
 from ngo_estimator.data.relative_step import RESTART_AFTER_NS, RelativeStep
 from ngo_estimator.data.weights_file import CheckpointError
-from ngo_estimator.frontend.camera.familiarity_watch import FamiliarityWatch, Told
+from ngo_estimator.frontend.camera.familiarity_watch import FamiliarityWatch
 from ngo_estimator.frontend.camera.frame_pairing import PairedFrame
 from ngo_estimator.frontend.rejected_frames import DuplicateFrame, LateFrame, RejectedFrame, UnusableImage
 from ngo_estimator.geometry import se2
@@ -231,8 +231,9 @@ class LocalOdometry:
                 relative, log_std = self._remembered(steps, relative, log_std, features)
         variance, unlike = torch.exp(2.0 * log_std.double()), [(0.0, False)] * len(steps)
         if self._watch is not None:
-            told = [Told(step.action, step.twist, step.missed > 0) for step in steps]
-            judged = self._watch.judge((earlier, later), early, told, (relative, variance, features))
+            taken, gaps = [step.action for step in steps], [step.missed > 0 for step in steps]
+            motions = relative, variance, features
+            judged = self._watch.judge((earlier, later), early, taken, twists, gaps, motions)
             unlike = [(each.unlikeness, each.repeated) for each in judged]
             relative = torch.from_numpy(np.array([each.relative for each in judged]))
             variance = torch.from_numpy(np.array([each.variance for each in judged]))
