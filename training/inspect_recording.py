@@ -58,8 +58,8 @@ def main(arguments: Arguments) -> Report:
     if arguments.json:
         print(json.dumps({**report.numbers(), "lidar": lidar, "picture": str(out)}))
     else:
-        told = ["", "lidar, as run_recording uses it:", *(f"  {line}" for line in lidar)] if lidar else []
-        print("\n".join(["", *text(report), *told, "", f"picture: {out}"]))
+        of_lidar = ["", "lidar, as run_recording uses it:", *(f"  {line}" for line in lidar)] if lidar else []
+        print("\n".join(["", *text(report), *of_lidar, "", f"picture: {out}"]))
     return report
 
 

@@ -3,7 +3,7 @@
     python -m training.train_deepvo --world maze3d
 
 DeepVO sees stretches of trajectories where the local network sees single pairs. Number of frame pairs, schedule, loss,
-mirror images and calibration are the same. As in the original it is not told the actions. Run it again to continue
+mirror images and calibration are the same. As in the original it does not take the actions. Run it again to continue
 after a stop.
 """
 

@@ -79,6 +79,6 @@ def page(result: Mapping[str, Any]) -> str:
             columns = [column for column in columns if column.key != "iou_true_poses"]
         settings, places = measured["settings"], result["places"][kind]
         scaled = "" if kind in ("mazes", "plans") else f", corridors of {settings['scale']:g} of the usual length"
-        told = {**measured, **settings, "places": places, "scaled": scaled, "poses": _POSES[poses]}
-        parts += [f"## {_KINDS[kind]}", _MEASURED.format(**told), table(shown, columns, "Rule")]
+        values = {**measured, **settings, "places": places, "scaled": scaled, "poses": _POSES[poses]}
+        parts += [f"## {_KINDS[kind]}", _MEASURED.format(**values), table(shown, columns, "Rule")]
     return whole([*parts, *figures(images)])

@@ -35,7 +35,7 @@ ROWS = {
     "registered": Row("odometry, each meta-step measured again by registering scans; no loops", registered=True),
     "smoothed": Row("odometry, smoothed as in our optimizer; no loops", smoothed=True),
     "local_no_action": Row(
-        "odometry of a local network that is not told the actions", odometry=LOCAL, worlds=("maze3d",)
+        "odometry of a local network that does not take the actions", odometry=LOCAL, worlds=("maze3d",)
     ),
     "deepvo": Row("DeepVO (Wang et al., 2017), trained on the same data", odometry=DEEPVO, worlds=("maze3d",)),
     "paper_1": Row("the paper's optimizer, 1 iteration", "paper", 1),

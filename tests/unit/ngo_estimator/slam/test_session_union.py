@@ -14,7 +14,7 @@ from ngo_estimator.nodes.join_sessions import Arguments
 from ngo_estimator.slam.map_origin import MapOrigin
 from ngo_estimator.slam.scan_trajectory import ScanTrajectory
 from ngo_estimator.slam.session import Session
-from ngo_estimator.slam.session_union import steps_again, united
+from ngo_estimator.slam.session_union import replayed_steps, united
 from ngo_estimator.slam.tf_smoothing import SmoothedCorrection
 from ngo_estimator.slam.trajectory_update import Trajectory
 from tests.golden.drives import WEIGHTS
@@ -52,7 +52,7 @@ def whole(core: ScanTrajectory) -> Trajectory:
 
 
 def test_a_session_is_driven_again_as_it_was() -> None:
-    first, *others = steps_again(session("first"))
+    first, *others = replayed_steps(session("first"))
     assert first.key is not None and not first.segment
     again = driven([replace(others[0], origin_scan=first.key.scan), *others[1:]])
     np.testing.assert_allclose(whole(again).poses_xyyaw, whole(session("first")).poses_xyyaw, atol=1e-6)

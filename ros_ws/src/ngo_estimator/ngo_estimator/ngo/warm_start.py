@@ -32,7 +32,7 @@ def resumed(
 ) -> Iterator[OptimizedMetaPoses]:
     """The result that begins at an earlier solution.
 
-    Loops that are new to the solution, of which ``closing`` was told, are judged as in the first iteration, which
+    Loops that the solution does not know are judged as in the first iteration, which
     allows for the odometry's drift, and then as in the last of the ``iterations``. Others keep what judging all loops
     from the odometry on gave them.
     """

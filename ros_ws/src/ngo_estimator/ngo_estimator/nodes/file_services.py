@@ -135,7 +135,7 @@ class StateServices(FileServices):
         self._newest = self._folder.expanduser() / Path(path).expanduser()
         self._take(self._loaded(self._session(), self._newest, relocalise))
 
-    def load_again(self) -> None:
+    def reload(self) -> None:
         """Load the state that was loaded or saved last, and look for the robot in it; raises ``ValueError``."""
         self._take(self._loaded(self._session(), self._newest, relocalise=True))
 

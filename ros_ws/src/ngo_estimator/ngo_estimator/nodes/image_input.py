@@ -134,10 +134,10 @@ class ImageInput:
             self._run(pairs[:AT_ONCE])
             del pairs[:AT_ONCE]
         if self._pairing.dropped > dropped:
-            told = [f"action on '{self._settings.action_topic}'"] if self._core.uses_action else []
-            told += [f"velocity on '{self._settings.twist_topic}'"] if self._core.uses_twist else []
+            controls = [f"action on '{self._settings.action_topic}'"] if self._core.uses_action else []
+            controls += [f"velocity on '{self._settings.twist_topic}'"] if self._core.uses_twist else []
             kind = f"{self._sensor} without {'action' if self._core.uses_action else 'velocity'}"
-            reason = f"the {' or the '.join(told)} that led to it did not come"
+            reason = f"the {' or the '.join(controls)} that led to it did not come"
             self._status.dropped(kind, reason, self._pairing.dropped - dropped)
         if self._core.restarts > restarts:
             self._node.get_logger().info(

@@ -122,7 +122,7 @@ class NgoNode(ManagedNode):
         )
         if settings.state:
             try:
-                files.load_at_start(settings.state, settings.looks_again)
+                files.load_at_start(settings.state, settings.relocalises)
             except ValueError as error:
                 raise StartError(f"state: {error}") from error
         files.open(_SERVICES, built)
@@ -203,7 +203,7 @@ class NgoNode(ManagedNode):
         try:
             step = messages.relative_step(message)
             with self._status.timed("time an update"):
-                self._look_again(step)
+                self._relocalise(step)
                 if self._search is not None:
                     found = self._search.update(step)
                     update = found.joined
@@ -241,7 +241,7 @@ class NgoNode(ManagedNode):
         else:
             log(f"internal error, the saved map is loaded again:\n{fault}")
             try:
-                self._files.load_again()
+                self._files.reload()
             except ValueError as error:
                 log(f"the map starts anew: {error}")
                 self._search = None
@@ -263,9 +263,9 @@ class NgoNode(ManagedNode):
         else:
             self._pending.cancel()
 
-    def _look_again(self, step: "RelativeStep") -> None:
+    def _relocalise(self, step: "RelativeStep") -> None:
         """Keep the map where the odometry begins anew, if the robot is to be found in it."""
-        if not self._settings.looks_again or self._search is not None or not self._core.begins_anew(step):
+        if not self._settings.relocalises or self._search is not None or not self._core.begins_anew(step):
             return
         with contextlib.suppress(ValueError):  # a map that shows no places yet
             self._look_for_the_robot()

@@ -11,7 +11,7 @@ if TYPE_CHECKING:
 
 
 class PoseSearch:
-    """Takes steps, keeps what the newest one told, and says it in diagnostics."""
+    """Takes steps, keeps what the newest one gave, and says it in diagnostics."""
 
     def __init__(self, search: "MapLocalisation | Joining") -> None:
         self._search = search

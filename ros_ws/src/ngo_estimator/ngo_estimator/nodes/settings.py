@@ -314,7 +314,7 @@ class NgoNodeSettings(EstimatorSettings):
         return self.mode == "localization" and self.map_changes == "ignore"
 
     @property
-    def looks_again(self) -> bool:
+    def relocalises(self) -> bool:
         """Whether the robot is looked for in the map where another odometry begins."""
         return self.mode == "localization" or self.state_mode == "relocalise"
 

@@ -59,7 +59,7 @@ def united(sessions: Sequence[ScanTrajectory]) -> Union:
 def _with(union: ScanTrajectory, session: ScanTrajectory) -> tuple[ScanTrajectory, int]:
     """The union with a session behind it, wherever that lies; and by how much its stamps are later (ns)."""
     grown = union.restored(union.state())
-    first, *steps = steps_again(session)
+    first, *steps = replayed_steps(session)
     ended_ns = grown.newest().stamp_ns
     later_ns = 0 if first.stamp_ns > ended_ns else ended_ns + _PAUSE_NS - first.stamp_ns
     grown.begin_segment(_later(first, later_ns))
@@ -69,7 +69,7 @@ def _with(union: ScanTrajectory, session: ScanTrajectory) -> tuple[ScanTrajector
     return grown, later_ns
 
 
-def steps_again(session: ScanTrajectory) -> Iterator[RelativeStep]:
+def replayed_steps(session: ScanTrajectory) -> Iterator[RelativeStep]:
     """The steps of a session as its odometry had them; the first, which nobody measured, ends at the first frame."""
     log, graph = session.log, session.back_end.graph
     stamps, frames = log.stamps_ns.values.tolist(), graph.frames.odometry
