@@ -43,13 +43,9 @@ from ngo_recordings.topics import RecordingTopics, TopicArguments, choose_scan, 
 
 if TYPE_CHECKING:
     from ngo_estimator.frontend.camera.local_odometry import LocalOdometry
-    from ngo_estimator.offline.camera_run import CameraRun
-    from ngo_estimator.offline.lidar_run import LidarRun
-    from ngo_estimator.offline.recorded import RecordedRun, RecordedStep
-    from ngo_estimator.offline.recording_run import RecordingRun
+    from ngo_estimator.offline.recorded import RecordedRun, RecordedStep, Run
 
-    AnyRun = RecordingRun | LidarRun | CameraRun
-    Started = tuple[str, RecordingTopics, AnyRun, Iterator[RecordedStep | RecordedRun]]
+    Started = tuple[str, RecordingTopics, Run, Iterator[RecordedStep | RecordedRun]]
 
 NAME = "run_recording"
 LIDAR_WORLD, CAMERA_WORLD = "scan", "camera"
@@ -164,7 +160,7 @@ def run(arguments: Arguments, console: Console) -> dict[str, Any]:
 def _run(arguments: Arguments, out: Path, console: Console) -> dict[str, Any]:
     """Run both estimators, write into ``out``, and return the content of run.json."""
     with open_recording(arguments.recordings) as recording:
-        core: AnyRun
+        core: Run
         source: ScanSource | None = None
         if arguments.uses_camera(recording):
             world, topics, core, events = _camera(arguments, recording, console)
@@ -204,7 +200,7 @@ def _write(
     out: Path,
     recording: Recording,
     topics: RecordingTopics,
-    core: "AnyRun",
+    core: "Run",
     events: "Iterator[RecordedStep | RecordedRun]",
     source: ScanSource | None,
     console: Console,
@@ -416,11 +412,11 @@ def _plain(value: object) -> str | float | None:
     return value if value is None or isinstance(value, float) else str(value)
 
 
-def _rejected(core: "AnyRun") -> list[tuple[str, int]]:
+def _rejected(core: "Run") -> list[tuple[str, int]]:
     return [(reason, count) for reason, count in core.rejected.items() if count]
 
 
-def _losses(core: "AnyRun", images: int) -> list[str]:
+def _losses(core: "Run", images: int) -> list[str]:
     """A line for each reason why images were not used, and one about gaps."""
     lines = []
     for reason, count in _rejected(core):

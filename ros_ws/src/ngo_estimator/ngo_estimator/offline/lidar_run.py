@@ -1,28 +1,23 @@
 """A lidar's estimators over the scans and wheels of a recording, as the live nodes compute (no ROS here)."""
 
 import math
-from collections import Counter
 from collections.abc import Iterable, Iterator
 from contextlib import suppress
 from typing import Any
 
+import numpy as np
+
 from ngo_estimator.frontend.intake.lidar_intake import LidarIntake, MountingOf
 from ngo_estimator.frontend.intake.wheel_clock import WheelTruth
 from ngo_estimator.frontend.lidar.mixture_lidar import MixtureLidar
-from ngo_estimator.frontend.rejected_frames import DuplicateFrame, LateFrame
 from ngo_estimator.geometry.scan_points import Mounting
-from ngo_estimator.offline.recorded import RecordedRun, RecordedStep, Truth
+from ngo_estimator.offline.recorded import RecordedRun, RecordedStep, Run, Truth
 from ngo_estimator.slam.scan_trajectory import ScanTrajectory
-from ngo_estimator.slam.trajectory_update import Trajectory
 from ngo_estimator.trajectory.files import seconds
 from ngo_recordings.scan_stream import ImuReading, LidarScan, WheelPose
 
 LidarRecord = LidarScan | WheelPose | ImuReading
 
-_REASONS: dict[type[ValueError], str] = {
-    DuplicateFrame: "the stamp came twice",
-    LateFrame: "older than the scan before",
-}
 _MOST_WALL_POINTS = 400_000
 _LEAST_LAG_S = 0.005
 """An age of scans that is said."""
@@ -38,7 +33,7 @@ _TO_BLAME = 0.5
 """Without wheels that are to blame, fewer scans than this share of those get lost."""
 
 
-class LidarRun:
+class LidarRun(Run):
     """Feeds scans and wheel poses through both estimators as the nodes do with messages.
 
     Args:
@@ -46,6 +41,8 @@ class LidarRun:
         mounting: where the scanner sits on the robot; or where the scanner of a frame does, for several.
         min_range_m: nearer ranges are not used.
     """
+
+    _online: ScanTrajectory
 
     def __init__(
         self,
@@ -55,23 +52,10 @@ class LidarRun:
         min_range_m: float = 0.0,
     ) -> None:
         mounting_of = (lambda frame: mounting) if isinstance(mounting, Mounting) else mounting
-        self._odometry, self._online = LidarIntake(odometry, mounting_of, min_range_m), online
-        self.frames = 0
-        """Scans that came."""
-        self.rejected: Counter[str] = Counter()
-        """Scans that were not used, by the reason."""
-        self.examples: dict[str, str] = {}
-        """For each reason the first such scan, in words."""
-        self.gaps = 0
-        """Steps that bridge scans that were lost."""
+        super().__init__(online, "scan")
+        self._odometry = LidarIntake(odometry, mounting_of, min_range_m)
         self.unsure = 0
         """Scans that did not say where they were taken."""
-        self.faults: list[str] = []
-        """What failed inside, in words; the trajectory went on by odometry there."""
-
-    def trajectory(self) -> Trajectory | None:
-        """The trajectory as it is now."""
-        return self._online.trajectory()
 
     @property
     def facts(self) -> dict[str, Any]:
@@ -80,7 +64,7 @@ class LidarRun:
             "unsure": self.unsure,
             "lag_s": self._odometry.lag_s,
             "mounting_yaw_deg": math.degrees(self._odometry.mounting_yaw_rad),
-            "faults": len(self.faults),
+            **super().facts,
         }
 
     def remarks(self) -> list[str]:
@@ -97,9 +81,7 @@ class LidarRun:
             )
         if self.unsure:
             lines.append(f"{self.unsure} scans did not say where they were taken: the motion was predicted there")
-        if self.faults:
-            lines.append(f"{len(self.faults)} faults, where it went on by odometry (first: {self.faults[0]})")
-        return lines
+        return lines + super().remarks()
 
     def learn(self, records: Iterable[LidarRecord]) -> WheelTruth:
         """Look at the beginning of a recording for what is to be known of scanners and wheels, before a run.
@@ -147,6 +129,7 @@ class LidarRun:
 
         A recording whose stamps jump back by a second or more holds several trajectories.
         """
+        truth = truth or Truth()
         self._odometry.reset()
         self._online.reset()
         for record in records:
@@ -163,7 +146,7 @@ class LidarRun:
                 try:
                     self._odometry.add_scan(record)
                 except ValueError as error:
-                    self._reject(_REASONS.get(type(error), "not usable"), f"{seconds(record.stamp_ns)} s: {error}")
+                    self._reject_frame(record.stamp_ns, error)
                 if self._odometry.restarts != restarts:
                     yield from self._finished(truth)
             yield from self._steps(at_end=False)
@@ -174,30 +157,12 @@ class LidarRun:
         while True:
             try:
                 for step in self._odometry.ready(at_end):
-                    update = self._online.update(step)
-                    self.gaps += update.gap
+                    taken = self._step(step)
                     self.unsure += step.unsure
-                    self._note_fault()
-                    yield RecordedStep(step, update)
+                    yield taken
                 return
             except ValueError as error:
                 self._reject("not usable", str(error))
 
-    def _note_fault(self) -> None:
-        if self._online.fault:
-            self.faults.append(self._online.fault)
-
-    def _reject(self, reason: str, example: str) -> None:
-        self.rejected[reason] += 1
-        self.examples.setdefault(reason, example)
-
-    def _finished(self, truth: Truth | None) -> Iterator[RecordedRun]:
-        """The trajectory that ends here, if there is one."""
-        if self._online.finish() is None:
-            self._note_fault()
-        trajectory, walls = self._online.trajectory(), self._online.walls(_MOST_WALL_POINTS)
-        graph = self._online.planar_graph()
-        self._online.reset()
-        if trajectory is not None and graph is not None:
-            true, residual = (truth or Truth()).poses()
-            yield RecordedRun(trajectory, graph, true, residual, walls)
+    def _walls(self) -> np.ndarray | None:
+        return self._online.walls(_MOST_WALL_POINTS)

@@ -1,6 +1,5 @@
 """Both estimators over the frames of a recording, as the live nodes compute without their middleware (no ROS here)."""
 
-from collections import Counter
 from collections.abc import Iterable, Iterator
 from typing import Any
 
@@ -11,20 +10,14 @@ from ngo_estimator.data.relative_step import RESTART_AFTER_NS, UNFAMILIAR
 from ngo_estimator.frontend.camera.familiarity_watch import NOT_FITTED
 from ngo_estimator.frontend.camera.frame_pairing import FramePairing, PairedFrame
 from ngo_estimator.frontend.camera.local_odometry import AT_ONCE, LocalOdometry
-from ngo_estimator.frontend.rejected_frames import DuplicateFrame, LateFrame, RejectedFrame
-from ngo_estimator.offline.recorded import RecordedRun, RecordedStep, Truth
+from ngo_estimator.frontend.rejected_frames import RejectedFrame
+from ngo_estimator.offline.recorded import RecordedRun, RecordedStep, Run, Truth
 from ngo_estimator.slam.online_trajectory import OnlineTrajectory
-from ngo_estimator.slam.trajectory_update import Trajectory
 from ngo_estimator.trajectory.files import seconds
 from ngo_recordings.frames import Frame
 
-_REASONS: dict[type[ValueError], str] = {
-    DuplicateFrame: "the stamp came twice",
-    LateFrame: "older than the frame before",
-}
 
-
-class RecordingRun:
+class RecordingRun(Run):
     """Feeds frames through both cores as the nodes do with messages, the networks several frames at once.
 
     Args:
@@ -41,39 +34,29 @@ class RecordingRun:
         action_capacity: int = 64,
         scan_yaw_rad: float = 0.0,
     ) -> None:
-        self._local, self._online, self._scan_yaw_rad = local, online, scan_yaw_rad
+        super().__init__(online, "frame")
+        self._local, self._scan_yaw_rad = local, scan_yaw_rad
         self._pairing = FramePairing(local.uses_action, action_timeout_ns, action_capacity, local.uses_twist)
-        self.frames = 0
-        """Frames that came."""
-        self.rejected: Counter[str] = Counter()
-        """Frames that were not used, by the reason."""
-        self.examples: dict[str, str] = {}
-        """For each reason the first such frame, in words."""
         self._unlikeness: list[float] = []
         self._repeated = 0
-        self.gaps = 0
-        """Steps that span more than the usual time between two frames."""
-
-    def trajectory(self) -> Trajectory | None:
-        """The trajectory as it is now."""
-        return self._online.trajectory()
 
     @property
     def facts(self) -> dict[str, Any]:
         """What else is worth keeping of the run."""
         if not self._local.tells_unlike_input:
-            return {"unlikeness": None}
+            return {"unlikeness": None, **super().facts}
         values = np.array(self._unlikeness or [0.0])
         return {
             "unlikeness": {"median": float(np.median(values)), "largest": float(values.max())},
             "unfamiliar_frames": int((values > UNFAMILIAR).sum()),
             "repeated_frames": self._repeated,
+            **super().facts,
         }
 
     def remarks(self) -> list[str]:
         """What a person should know of the run, a line each."""
         if not self._local.tells_unlike_input:
-            return [NOT_FITTED]
+            return [NOT_FITTED, *super().remarks()]
         values, lines = np.array(self._unlikeness), []
         if unfamiliar := int((values > UNFAMILIAR).sum()):
             lines.append(
@@ -82,7 +65,7 @@ class RecordingRun:
             )
         if self._repeated:
             lines.append(f"{self._repeated} frames repeat the one before while the robot was told to move")
-        return lines
+        return lines + super().remarks()
 
     def run(self, frames: Iterable[Frame]) -> Iterator[RecordedStep | RecordedRun]:
         """Every step, and after the last one of a trajectory the whole of it.
@@ -101,7 +84,7 @@ class RecordingRun:
         for frame in frames:
             self.frames += 1
             if before_ns is not None and frame.stamp_ns <= before_ns - RESTART_AFTER_NS:
-                yield from self._finished(truth)
+                yield from self._ended(truth)
                 truth, before_ns = Truth(), None
             # What led to a frame, stamped as in the messages: an action at the frame before, a velocity up to its own.
             if frame.action is not None and before_ns is not None and before_ns < frame.stamp_ns:
@@ -115,7 +98,7 @@ class RecordingRun:
             self._paired += self._pairing.ready()
             while len(self._paired) >= AT_ONCE:
                 yield from self._steps()
-        yield from self._finished(truth)
+        yield from self._ended(truth)
         if missing := self._pairing.dropped + self._pairing.waiting:
             self.rejected["no action or velocity led to it"] = missing
 
@@ -125,7 +108,7 @@ class RecordingRun:
             image = observation(self._local.image_format, frame.image, frame.scan, self._scan_yaw_rad)
             self._pairing.add_frame(frame.stamp_ns, image)
         except ValueError as error:
-            self._reject(_REASONS.get(type(error), "not usable"), f"{seconds(frame.stamp_ns)} s: {error}")
+            self._reject_frame(frame.stamp_ns, error)
             return False
         return True
 
@@ -138,30 +121,22 @@ class RecordingRun:
                     raise local
                 if local is None:
                     continue
-                update = self._online.update(local)
+                taken = self._step(local)
             except ValueError as error:
                 self._reject("not usable", f"{seconds(pair.stamp_ns)} s: {error}")
                 continue
-            if update.restarted:
+            if taken.update.restarted:
                 raise ValueError(
                     f"the odometry goes too far from one frame to the next at {seconds(local.stamp_ns)} s: split the "
                     "recording there, or use weights that know this robot"
                 )
-            self.gaps += update.gap or local.missed_frames > 0
+            self.gaps += local.missed_frames > 0 and not taken.update.gap
             self._unlikeness.append(local.unlikeness)
             self._repeated += local.repeated
-            yield RecordedStep(local, update)
+            yield taken
 
-    def _reject(self, reason: str, example: str) -> None:
-        self.rejected[reason] += 1
-        self.examples.setdefault(reason, example)
-
-    def _finished(self, truth: Truth) -> Iterator[RecordedStep | RecordedRun]:
+    def _ended(self, truth: Truth) -> Iterator[RecordedStep | RecordedRun]:
         """The last steps of the trajectory that ends here, and the whole of it, if there is one."""
         yield from self._steps()
-        self._online.finish()
-        trajectory, graph = self._online.trajectory(), self._online.planar_graph()
         self._local.reset()
-        self._online.reset()
-        if trajectory is not None and graph is not None:
-            yield RecordedRun(trajectory, graph, *truth.poses())
+        yield from self._finished(truth)
