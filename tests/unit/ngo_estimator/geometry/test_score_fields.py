@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from ngo_estimator.geometry.mode_search import Mixture, SearchWindow, two_modes
+from ngo_estimator.geometry.mode_search import Mixture, two_modes
 from ngo_estimator.geometry.planar_motion import inverted, transformed
 from ngo_estimator.geometry.scan_matching import Registration
 from ngo_estimator.geometry.score_field import RayCounts, ScoreField, ScoreFieldConfig
@@ -36,18 +36,18 @@ def mixture(seed: int) -> Mixture:
 @pytest.mark.parametrize("seed", range(2))
 def test_the_best_mode_is_that_of_all_poses(seed: int) -> None:
     field, points, prior = seen(walls(seed)), walls(seed + 100)[::3], mixture(seed)
-    window = SearchWindow(np.array((0.1, -0.05, 0.2)), 0.6, math.radians(12.0), math.radians(2.0))
-    best, total = two_modes(field, points, window, prior, 0.04, (0.3, 0.1), 3.0)[0]
+    window = np.array((0.1, -0.05, 0.2)), (0.6, math.radians(12.0)), math.radians(2.0)
+    best, total = two_modes(field, points, *window, prior, 0.04, (0.3, 0.1), 3.0)[0]
     cell = CONFIG.cell_m
     totals = {}
     padded = np.pad(field.levels[0], 100, constant_values=round(255 * CONFIG.unknown))
     for turn in np.arange(-6, 7):
         # The search moves whole cells: points are rounded before they are moved.
-        turned = transformed(window.centre + (0.0, 0.0, turn * math.radians(2.0)), points)
+        turned = transformed(window[0] + (0.0, 0.0, turn * math.radians(2.0)), points)
         cells = np.floor((turned - field.corner) / cell)
         for x in range(-10, 11):
             for y in range(-10, 11):
-                pose = window.centre + (x * cell, y * cell, turn * math.radians(2.0))
+                pose = window[0] + (x * cell, y * cell, turn * math.radians(2.0))
                 rows, columns = (cells[:, 1] + y).astype(int), (cells[:, 0] + x).astype(int)
                 score = padded[rows + 100, columns + 100].mean() / 255.0
                 totals[tuple(pose)] = score + 0.04 * prior.logs(pose).max()
@@ -59,8 +59,8 @@ def test_two_places_that_look_alike_are_both_found() -> None:
     """A row of equal posts: half a metre on, all but one of them fit again."""
     posts = np.stack((np.arange(-3.0, 3.1, 0.5), np.full(13, 1.0)), -1)
     flat = Mixture(np.zeros((1, 3)), np.full((1, 2), 2.0), np.zeros(1))
-    window = SearchWindow(np.zeros(3), 0.7, 0.05, 0.02)
-    modes = two_modes(seen(posts), posts, window, flat, 0.04, (0.3, 0.1), 0.2)
+    window = np.zeros(3), (0.7, 0.05), 0.02
+    modes = two_modes(seen(posts), posts, *window, flat, 0.04, (0.3, 0.1), 0.2)
     assert len(modes) == 2
     np.testing.assert_allclose(modes[0][0], 0.0, atol=0.04)
     assert abs(abs(modes[1][0][0]) - 0.5) < 0.07 and modes[1][1] < modes[0][1]

@@ -47,20 +47,12 @@ class Mixture:
         return result
 
 
-@dataclass(frozen=True)
-class SearchWindow:
-    """A window ``half_m`` and ``half_rad`` to each side of ``centre`` ``(3,)``; headings are ``step_rad`` apart."""
-
-    centre: Array
-    half_m: float
-    half_rad: float
-    step_rad: float
-
-
 def two_modes(
     field: ScoreField,
     points: Array,
-    window: SearchWindow,
+    centre: Array,
+    half: tuple[float, float],
+    step_rad: float,
     prior: Mixture,
     weight: float,
     apart: tuple[float, float],
@@ -68,20 +60,19 @@ def two_modes(
 ) -> list[tuple[Array, float]]:
     """The best pose ``(3,)`` with its total, and the best of those ``apart`` (m, rad) from it.
 
-    The second is there if it is no more than ``margin`` worse. ``points`` ``(n, 2)`` are those of the scan; at least
-    one.
+    The second is there if it is no more than ``margin`` worse. Searched is ``half`` (m, rad) to each side of ``centre``
+    ``(3,)``, at headings ``step_rad`` apart. ``points`` ``(n, 2)`` are those of the scan; at least one.
     """
     cell = field.config.cell_m
-    half = max(1, math.ceil(window.half_m / cell))
-    turns = max(1, math.ceil(window.half_rad / window.step_rad))
+    cells, turns = max(1, math.ceil(half[0] / cell)), max(1, math.ceil(half[1] / step_rad))
     found = _modes(
         field.levels,
         round(255 * field.config.unknown),
         points,
         field.corner,
-        window.centre,
-        (turns, window.step_rad),
-        half,
+        centre,
+        (turns, step_rad),
+        cells,
         cell,
         prior.means,
         prior.deviations,
@@ -92,9 +83,9 @@ def two_modes(
         margin,
         _MOST_BLOCKS,
     )
-    x, y, yaw = window.centre.tolist()
+    x, y, yaw = centre.tolist()
     return [
-        (np.array((x + column * cell, y + row * cell, wrap(yaw + (a - turns) * window.step_rad))), total)
+        (np.array((x + column * cell, y + row * cell, wrap(yaw + (a - turns) * step_rad))), total)
         for total, a, column, row in found
     ]
 

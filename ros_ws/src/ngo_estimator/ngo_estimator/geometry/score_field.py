@@ -53,7 +53,8 @@ class RayCounts:
         self.config = config
         self.hits = np.zeros((config.side, config.side), np.int16)
         self.passes = np.zeros((config.side, config.side), np.int16)
-        self._scans: deque[tuple[Cells, Cells]] = deque()  # cells in which rays of each ended, and passed
+        # Of each: cells in which rays ended, and that they passed; the origin and the ends.
+        self._scans: deque[tuple[Cells, Cells, Array, Array]] = deque()
         self._marks, self._mark = np.zeros((config.side, config.side), np.int32), 0
         self._kernel = _kernel(config)
         self.begin_at(middle)
@@ -66,18 +67,25 @@ class RayCounts:
         # Row and column of what was seen.
         self._low, self._high = np.full(2, self.config.side, np.int64), np.zeros(2, np.int64)
 
+    def move_to(self, middle: Array) -> None:
+        """Count the same scans round another ``middle``."""
+        scans = list(self._scans)
+        self.begin_at(middle)
+        for *_, origin, ends in scans:
+            self.add(origin, ends)
+
     def add(self, origin: Array, ends: Array) -> None:
         """Count a scan's rays from ``origin`` ``(2,)`` to their ``ends`` ``(n, 2)``."""
         self._mark += 2
-        origin, ends = origin - self.corner, ends - self.corner
-        _widen(self._low, self._high, origin, ends, self.config.cell_m, self.config.side)
-        cells = _seen(self._marks, origin, ends, self.config.cell_m, self._mark)
-        self._scans.append(cells)
+        begin, stops = origin - self.corner, ends - self.corner
+        _widen(self._low, self._high, begin, stops, self.config.cell_m, self.config.side)
+        cells = _seen(self._marks, begin, stops, self.config.cell_m, self._mark)
+        self._scans.append((*cells, origin, ends))
         _count(self.hits, self.passes, *cells, 1)
 
     def forget_oldest(self) -> None:
         """Take back the oldest scan."""
-        _count(self.hits, self.passes, *self._scans.popleft(), -1)
+        _count(self.hits, self.passes, *self._scans.popleft()[:2], -1)
 
     def walls(self, points: Array) -> NDArray[np.bool_]:
         """Which of the points ``(n, 2)`` are on walls: not more rays passed there than the settings say."""

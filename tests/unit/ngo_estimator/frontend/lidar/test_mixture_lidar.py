@@ -117,7 +117,7 @@ def test_what_was_seen_before_decides_whether_a_scan_fits() -> None:
     lidar = MixtureLidar()
     fed(records(way(20)), lidar)
     core = lidar._core
-    placed = core._submap._scans[-1].points[::4]
+    placed = core._submap._scans[-1][0][::4]
     new = np.stack((np.linspace(100.0, 110.0, 3 * len(placed)), np.full(3 * len(placed), 100.0)), -1)
     seen_through = 0.5 * placed + 0.5 * core._pose[:2]
     assert core._fits(np.concatenate((placed, new)), np.zeros(3))

@@ -34,7 +34,7 @@ def test_a_reading_that_is_missing_leaves_its_gap() -> None:
 def test_wheels_that_fell_silent_tell_nothing() -> None:
     wheels = driven([100.0 * k for k in range(20)])
     assert wheels.pose_at(1.9) is not None and wheels.pose_at(2.5) is None
-    assert wheels.motion(1.0, 2.6, np.eye(3)) is None and wheels.paused(1.0, 4.0, 1.5)
+    assert wheels.motion(1.0, 2.6, np.eye(3)) is None and wheels.gaps(1.0, 4.0, 1.5)[1] == pytest.approx(2.1)
 
 
 def test_gaps_that_reach_into_a_time_are_told_with_their_share_of_it() -> None:

@@ -9,11 +9,11 @@ from pathlib import Path
 
 import numpy as np
 
-from ngo_estimator.data.relative_step import LARGEST_ODOMETRY, RESTART_AFTER_NS, KeyScanStep
+from ngo_estimator.data.relative_step import LARGEST_ODOMETRY, RESTART_AFTER_NS
 from ngo_estimator.frontend.lidar.even_stamps import UsualPeriod
 from ngo_estimator.frontend.lidar.lidar_step import LidarStep
 from ngo_estimator.frontend.lidar.mixture_config import MixtureConfig, read_mixture_config
-from ngo_estimator.frontend.lidar.mixture_odometry import MixtureOdometry, ScanEstimate
+from ngo_estimator.frontend.lidar.mixture_odometry import MixtureOdometry
 from ngo_estimator.frontend.lidar.stamped_wheels import StampedWheels
 from ngo_estimator.frontend.rejected_frames import DuplicateFrame, LateFrame, UnusableImage
 from ngo_estimator.geometry.key_scan import KeyScan
@@ -41,9 +41,6 @@ _SILENT_S = 1.0
 
 _SWEPT_M, _SWEPT_RAD = 0.005, 0.005
 """Motion until the middle of a sweep that is too small to remove it anew."""
-
-_LEAST = np.diag((1e-8, 1e-8, 1e-9))
-"""The smallest covariance of a step."""
 
 
 class MixtureLidar:
@@ -73,13 +70,10 @@ class MixtureLidar:
         self._waiting: deque[tuple[LidarScan, float]] = deque()  # with the evened stamp (s)
         self._held: list[LidarScan] = []  # that may be a bunch
         self._newest_ns: int | None = None
-        self._last: KeyScan | None = None
-        self._last_s = 0.0
+        self._last_s: float | None = None
         self._even_s = 0.0
         self._twist = np.zeros(3)
-        self._origin: KeyScan | None = None
         self._robot_odom: Array | None = None
-        self._key_ns = self._origin_ns = 0
 
     @property
     def waiting(self) -> int:
@@ -181,62 +175,29 @@ class MixtureLidar:
         )
 
     def _step(self, scan: LidarScan, at_s: float) -> LidarStep | None:
-        last, gap_s = self._last, at_s - self._last_s
-        if last is None:
-            key = self._key_scan(scan, None if self._wheels is None else self._sweep(scan, at_s, math.inf))
-            self._core.begin(key)
-            self._origin, self._origin_ns, self._key_ns = key, key.stamp_ns, key.stamp_ns
-            self._last, self._last_s = key, at_s
+        last_s, wheels, calibration = self._last_s, self._wheels, self._core.mixture.calibration.matrix
+        if last_s is None:
+            self._core.begin(self._key_scan(scan, None if wheels is None else self._sweep(scan, at_s, math.inf)))
+            self._last_s = at_s
             return None
-        by_wheels = counted = None
-        if self._wheels is not None:
-            by_wheels = self._wheels.motion(self._last_s, at_s, self._core.mixture.calibration.matrix)
-            counted = self._wheels.counted(self._last_s, at_s)
+        gap_s = at_s - last_s
+        by_wheels = None if wheels is None else wheels.motion(last_s, at_s, calibration)
+        counted = None if wheels is None else wheels.motion(last_s, at_s, np.eye(3))
         sweep = self._sweep(scan, at_s, gap_s)
-        key = self._key_scan(scan, sweep)
         again = None if sweep is None else partial(self._swept_again, scan, sweep, gap_s)
-        gap = gap_s / max(self._period.period_s, 1e-3)
-        long = gap_s > self.config.silent_s and gap > self.config.most_gap
-        silent = long and (by_wheels is None or self._wheels_paused(at_s - gap_s, at_s))
-        estimate = self._core.update(key, by_wheels, counted, gap, silent, again)
-        if self._wheels is not None and not estimate.unsure:
-            self._wheels.observe_turn(self._last_s, at_s, float(estimate.step[2]))
-        self._last, self._last_s = key, at_s
-        self._twist = arc_velocity(estimate.step, max(gap_s, 1e-3))
-        return self._published(estimate.scan, last, estimate, at_s)
-
-    def _wheels_paused(self, from_s: float, to_s: float) -> bool:
-        return self._wheels is not None and self._wheels.paused(from_s, to_s, self.config.silent_s)
-
-    def _published(self, key: KeyScan, last: KeyScan, estimate: ScanEstimate, at_s: float) -> LidarStep:
-        key_step = None
-        if estimate.is_key:
-            if estimate.walls is not None:
-                key = replace(key, points=key.points[estimate.walls], normals=key.normals[estimate.walls])
-            key_step = KeyScanStep(key, self._key_ns, estimate.since_key, estimate.since_key_covariance + _LEAST)
-            self._key_ns = key.stamp_ns
-        origin, self._origin = self._origin, None
-        nothing = np.zeros(0, np.float32)
-        pose = None if self._wheels is None else self._wheels.pose_at(at_s)
+        gap, longest_s = gap_s / max(self._period.period_s, 1e-3), self.config.silent_s
+        silent = gap_s > longest_s and gap > self.config.most_gap
+        if silent and wheels is not None and by_wheels is not None:
+            silent = bool((wheels.gaps(last_s, at_s, longest_s)[1] > longest_s).any())
+        step = self._core.update(self._key_scan(scan, sweep), by_wheels, counted, gap, silent, again)
+        self._last_s, self._twist = at_s, arc_velocity(step.relative_xyyaw, max(gap_s, 1e-3))
+        if wheels is not None and not step.unsure:
+            wheels.observe_turn(last_s, at_s, float(step.relative_xyyaw[2]))
+        pose = None if wheels is None else wheels.pose_at(at_s)
         if pose is None and self._robot_odom is not None:
-            pose = compose(self._robot_odom, estimate.step)
+            pose = compose(self._robot_odom, step.relative_xyyaw)
         self._robot_odom = pose
-        return LidarStep(
-            stamp_ns=key.stamp_ns,
-            from_stamp_ns=last.stamp_ns,
-            relative_xyyaw=estimate.step,
-            covariance=estimate.step_covariance + _LEAST,
-            origin_stamp_ns=self._origin_ns,
-            odom_xyyaw=estimate.pose,
-            motion_feature=nothing,
-            place_code=nothing,
-            share=estimate.score,
-            unsure=estimate.unsure,
-            key=key_step,
-            origin_scan=origin,
-            robot_odom_xyyaw=pose,
-            segment=estimate.segment,
-        )
+        return replace(step, robot_odom_xyyaw=pose)
 
     def _key_scan(self, scan: LidarScan, sweep: Sweep | None) -> KeyScan:
         largest = scan.range_max if 0.0 < scan.range_max < _FARTHEST_M else _FARTHEST_M

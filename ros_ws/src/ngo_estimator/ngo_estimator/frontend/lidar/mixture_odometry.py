@@ -9,17 +9,18 @@ reckoned, and after a while begins a new segment with an empty submap: what is n
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import NamedTuple
 
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from ngo_estimator.data.relative_step import KeyScanStep
+from ngo_estimator.frontend.lidar.lidar_step import LidarStep
 from ngo_estimator.frontend.lidar.mixture_config import MixtureConfig
 from ngo_estimator.frontend.lidar.motion_mixture import ANY, MotionMixture
 from ngo_estimator.frontend.lidar.rolling_submap import RollingSubmap
 from ngo_estimator.geometry.key_scan import KeyScan
-from ngo_estimator.geometry.mode_search import Mixture, SearchWindow, two_modes
+from ngo_estimator.geometry.mode_search import Mixture, two_modes
 from ngo_estimator.geometry.planar_motion import (
     Array,
     between,
@@ -56,29 +57,8 @@ _FIRST_USUAL = 0.9
 _FEWEST = 12
 """Points without which a scan does not contradict what was seen."""
 
-
-@dataclass(frozen=True, eq=False)
-class ScanEstimate:
-    """Where a scan was taken.
-
-    ``step`` ``(3,)`` is its pose seen from the last scan, with ``step_covariance``; ``pose`` ``(3,)`` that in ``odom``;
-    ``since_key`` ``(3,)`` that seen from the last key scan, with ``since_key_covariance`` where it is one itself.
-    ``score`` is how well it fits, 0 to 1. ``unsure`` scans fitted nowhere. With ``segment`` nothing ties the scan to
-    those before. ``scan`` is the scan without the sweep's motion. Of a key scan ``walls`` ``(n,)`` tells which points
-    are on walls.
-    """
-
-    step: Array
-    step_covariance: Array
-    pose: Array
-    since_key: Array
-    since_key_covariance: Array
-    is_key: bool
-    score: float
-    unsure: bool
-    segment: bool
-    scan: KeyScan
-    walls: NDArray[np.bool_] | None = None
+_LEAST = np.diag((1e-8, 1e-8, 1e-9))
+"""The smallest covariance of a step."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -96,11 +76,6 @@ class _Mode:
     def walls(self) -> Array:
         """Covariance by the walls alone."""
         return inverted(self.found.information + _UNKNOWN)
-
-
-class _Points(NamedTuple):
-    points: Array
-    normals: Array
 
 
 class MixtureOdometry:
@@ -123,6 +98,8 @@ class MixtureOdometry:
     def begin(self, scan: KeyScan) -> None:
         """Take the first scan, which is a key scan at the origin."""
         self._submap.add(scan, self._pose)
+        self._origin: KeyScan | None = scan
+        self._origin_ns = self._last_ns = self._key_ns = scan.stamp_ns
 
     def update(
         self,
@@ -132,8 +109,8 @@ class MixtureOdometry:
         gap: float,
         silent: bool,
         again: Callable[[Array], KeyScan | None] | None = None,
-    ) -> ScanEstimate:
-        """Estimate where a scan was taken.
+    ) -> LidarStep:
+        """The step to a scan.
 
         Args:
             scan: newer than the last one.
@@ -148,11 +125,18 @@ class MixtureOdometry:
         found = None if silent else self._found(scan)
         if found is not None and again is not None:
             scan, found = self._swept_again(scan, found, again)
-        before = self._pose
+        config, before = self.config, self._pose
         if found is None:
             pose, covariance = self.mixture.foretold(before, self._covariance)
             self.mixture.take(self.mixture.heaviest, before, pose, covariance, None)
-            return self._accepted(scan, pose, covariance, 0.0, True, silent or self._is_gone(pose, covariance), silent)
+            segment = silent or self._is_gone(pose, covariance)
+            if segment:
+                covariance = config.doubted**2 * covariance
+                if silent:
+                    covariance += np.diag((config.open_m**2, config.open_m**2, config.open_rad**2))
+                self._submap.clear()
+                self._reckoned, self._doubt = np.zeros(2), np.zeros((3, 3))
+            return self._accepted(scan, pose, covariance, 0.0, True, segment)
         step, walls = between(before, found.pose), turned_covariance(-before[2], found.walls)
         covariance = found.found.covariance
         self.mixture.learn(step, walls)
@@ -160,7 +144,7 @@ class MixtureOdometry:
         self._reckoned = np.zeros(2)
         rate = min(0.1, math.hypot(step[0], step[1]) + abs(step[2])) if self._usual else 1.0
         self._usual += rate * (found.score - self._usual)
-        return self._accepted(scan, found.pose, covariance, found.score, False, False, False)
+        return self._accepted(scan, found.pose, covariance, found.score)
 
     def _is_gone(self, pose: Array, covariance: Array) -> bool:
         """Whether too much was dead reckoned to go on: by its way and turn, or by the deviation of where it led."""
@@ -184,40 +168,42 @@ class MixtureOdometry:
         return (other, refound) if refound.score >= found.score else (scan, found)
 
     def _accepted(
-        self, scan: KeyScan, pose: Array, covariance: Array, score: float, lost: bool, segment: bool, silent: bool
-    ) -> ScanEstimate:
-        config = self.config
-        if segment:
-            covariance = covariance * config.doubted**2
-            if silent:
-                covariance = covariance + np.diag((config.open_m**2, config.open_m**2, config.open_rad**2))
-            self._submap.clear()
-            self._reckoned = np.zeros(2)
-        step, since_key = between(self._pose, pose), between(self._key, pose)
-        both = covariance + self._covariance
+        self, scan: KeyScan, pose: Array, covariance: Array, score: float, unsure: bool = False, segment: bool = False
+    ) -> LidarStep:
+        """The step to a scan of a pose ``(3,)`` and its ``covariance``; ``score`` is how well it fits, 0 to 1."""
+        config, last, key = self.config, self._pose, None
+        step_covariance = turned_covariance(-last[2], covariance + self._covariance) + _LEAST
+        self._pose, self._covariance, since_key = pose, covariance, between(self._key, pose)
         key_way, key_turn = math.hypot(since_key[0], since_key[1]), abs(since_key[2])
         far = max(key_way / config.key_m, key_turn / math.radians(config.key_deg))
-        is_key = segment or (not lost and (far >= 1.0 or (far > 0.3 and score < config.new_share * self._usual)))
-        estimate = ScanEstimate(
-            step,
-            turned_covariance(-self._pose[2], both),
-            pose,
-            since_key,
-            turned_covariance(-self._key[2], covariance + (self.mixture.filter.shared() if is_key else 0.0)),
-            is_key,
-            score,
-            lost,
-            segment,
-            scan,
-        )
-        self._pose, self._covariance = pose, covariance
-        self._doubted_key = self._doubt if is_key and not segment else np.zeros((3, 3))
-        if is_key:
-            self._key, self._covariance = pose, np.zeros((3, 3))
-            self.mixture.filter.begin_at_key()
+        self._doubted_key = np.zeros((3, 3))
+        if segment or (not unsure and (far >= 1.0 or (far > 0.3 and score < config.new_share * self._usual))):
+            shared = turned_covariance(-self._key[2], covariance + self.mixture.filter.shared()) + _LEAST
             self._submap.add(scan, pose)
-            estimate = replace(estimate, walls=self._submap.walls(transformed(pose, scan.points)))
-        return estimate
+            walls = self._submap.walls(transformed(pose, scan.points))
+            seen = replace(scan, points=scan.points[walls], normals=scan.normals[walls])
+            key = KeyScanStep(seen, self._key_ns, since_key, shared)
+            self._key, self._key_ns, self._doubted_key = pose, scan.stamp_ns, self._doubt
+            self._covariance = np.zeros((3, 3))
+            self.mixture.filter.begin_at_key()
+        nothing = np.zeros(0, np.float32)
+        step = LidarStep(
+            stamp_ns=scan.stamp_ns,
+            from_stamp_ns=self._last_ns,
+            relative_xyyaw=between(last, pose),
+            covariance=step_covariance,
+            origin_stamp_ns=self._origin_ns,
+            odom_xyyaw=pose,
+            motion_feature=nothing,
+            place_code=nothing,
+            share=score,
+            unsure=unsure,
+            key=key,
+            origin_scan=self._origin,
+            segment=segment,
+        )
+        self._last_ns, self._origin = scan.stamp_ns, None
+        return step
 
     def _prior(self, walls: Array | None, wide: bool = False) -> Mixture:
         """The prior of where the place is chosen, as ``walls`` ``(3, 3)`` would measure it; ``wide`` where no place
@@ -250,7 +236,7 @@ class MixtureOdometry:
         Modes are those near the means of the hypotheses, and the two best of the search where these are others.
         """
         config = self.config
-        few = _on_lines(scan, config.search_points)
+        few, step_rad = _on_lines(scan, config.search_points), math.radians(config.heading_step_deg)
         points = few.points
         if not len(points):
             return None
@@ -261,7 +247,7 @@ class MixtureOdometry:
                 prior, begun = self._prior(None, wide), [self._fit(few, k, None, weight, wide) for k in starts]
             fits = begun.copy()
             for pose, _ in two_modes(
-                self._submap.field, points, self._window(prior, reach), prior, weight,
+                self._submap.field, points, *self._window(prior, reach), step_rad, prior, weight,
                 (config.apart_m, math.radians(config.apart_deg)), config.margin * weight,
             ):  # fmt: skip
                 if not any(self._is_same(pose, other.pose) for other in fits):
@@ -311,22 +297,18 @@ class MixtureOdometry:
         distinct: list[int] = usable[_distinct(mixture.steps[usable], deviations[usable], *same)].tolist()
         return distinct
 
-    def _window(self, prior: Mixture, reach: int) -> SearchWindow:
-        config = self.config
+    def _window(self, prior: Mixture, reach: int) -> tuple[Array, tuple[float, float]]:
+        """The middle ``(3,)`` of the search, and how far it goes to each side (m, rad)."""
+        config, most = self.config, (self.config.most_window_m, math.pi)
         centre = prior.means[int(prior.log_weights.argmax())].copy()
-        most_m, most_rad = config.most_window_m, math.pi
         if reach == EVERYWHERE:
-            return SearchWindow(centre, most_m, most_rad, math.radians(config.heading_step_deg))
+            return centre, most
         last = len(prior.means) - (reach == LIKELY)
         metres, radians = _reach(prior.means[:last], prior.deviations[:last], centre)
-        return SearchWindow(
-            centre,
-            min(max(metres, config.least_window_m), most_m),
-            min(max(radians, math.radians(config.least_window_deg)), most_rad),
-            math.radians(config.heading_step_deg),
-        )
+        least = config.least_window_m, math.radians(config.least_window_deg)
+        return centre, (min(max(metres, least[0]), most[0]), min(max(radians, least[1]), most[1]))
 
-    def _fit(self, few: _Points, hypothesis: int, start: Array | None, weight: float, wide: bool = False) -> _Mode:
+    def _fit(self, few: KeyScan, hypothesis: int, start: Array | None, weight: float, wide: bool = False) -> _Mode:
         """A mode, registered under a hypothesis from where that has it, or from ``start`` ``(3,)``."""
         mean, covariance = self.mixture.expected(hypothesis, self._pose, self._covariance)
         if start is None:
@@ -340,7 +322,7 @@ class MixtureOdometry:
         mode = _Mode(found, hypothesis, self._submap.field.score(few.points, found.pose), 0.0)
         return replace(mode, total=mode.score + weight * self._prior(mode.walls, wide).log(found.pose))
 
-    def _sharpened(self, scan: KeyScan, few: _Points, mode: _Mode) -> _Mode:
+    def _sharpened(self, scan: KeyScan, few: KeyScan, mode: _Mode) -> _Mode:
         """A mode of the ``few`` points, registered with all of the scan's under the hypothesis that is likeliest."""
         mixture, walls = self.mixture, mode.walls
         likeliest = mixture.likeliest(mode.pose, mixture.prior(self._pose, self._covariance, walls, (0.0, 0.0)))
@@ -352,9 +334,7 @@ class MixtureOdometry:
         found = held_along(found, self._submap.field, few.points, self._usual, self.config.noise, weight)
         return _Mode(found, likeliest, self._submap.field.score(few.points, found.pose), mode.total)
 
-    def _icp(
-        self, scan: KeyScan | _Points, start: Array, mean: Array, information: Array, config: IcpConfig
-    ) -> Registration:
+    def _icp(self, scan: KeyScan, start: Array, mean: Array, information: Array, config: IcpConfig) -> Registration:
         return icp(self._submap.lines, scan.points, scan.normals, start, (mean, information), config, _OPEN_SHARE)
 
 
@@ -391,10 +371,10 @@ def _reach(means: Array, deviations: Array, centre: Array) -> tuple[float, float
     return metres, radians
 
 
-def _on_lines(scan: KeyScan, most: int) -> _Points:
+def _on_lines(scan: KeyScan, most: int) -> KeyScan:
     """At most so many of a scan's points, of those on lines where these are enough."""
     kept = np.flatnonzero((scan.normals[:, 0] != 0.0) | (scan.normals[:, 1] != 0.0))
     if len(kept) < 2 * _FEWEST:
         kept = np.arange(len(scan.points))
     kept = kept[:: max(1, math.ceil(len(kept) / most))]
-    return _Points(scan.points[kept], scan.normals[kept])
+    return replace(scan, points=scan.points[kept], normals=scan.normals[kept])

@@ -2,7 +2,6 @@
 
 import math
 from collections import deque
-from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,21 +15,11 @@ _REDRAWN_M = 4.0
 """The counts are made anew where the robot is so far from their middle."""
 
 
-@dataclass(frozen=True, eq=False)
-class _Placed:
-    points: Array
-    normals: Array
-    squares: NDArray[np.int64]
-    drawn: Array
-    origin: Array
-    ends: Array
-
-
 class RollingSubmap:
     """At most ``most_scans`` key scans in the odometry's frame; lines and field are made when first asked for."""
 
     def __init__(self, most_scans: int, config: ScoreFieldConfig) -> None:
-        self._scans: deque[_Placed] = deque()
+        self._scans: deque[tuple[Array, Array, NDArray[np.int64], Array]] = deque()  # points, normals, squares, drawn
         self._most, self._config = most_scans, config
         self._counts = RayCounts(config, np.zeros(2))
         self._lines: LineMap | None = None
@@ -53,13 +42,10 @@ class RollingSubmap:
         angles, ranges = scan.angles[seen], scan.ranges[seen]
         ends = transformed(sensor, np.stack((ranges * np.cos(angles), ranges * np.sin(angles)), axis=-1))
         drawn = joined(points, normals, self._config.cell_m)
-        self._scans.append(_Placed(points, normals, line_squares(points, normals), drawn, sensor[:2], ends))
-        if np.hypot(*(pose[:2] - self._counts.middle)) < _REDRAWN_M:
-            self._counts.add(sensor[:2], ends)
-        else:
-            self._counts.begin_at(pose[:2].copy())
-            for placed in self._scans:
-                self._counts.add(placed.origin, placed.ends)
+        self._scans.append((points, normals, line_squares(points, normals), drawn))
+        if np.hypot(*(pose[:2] - self._counts.middle)) >= _REDRAWN_M:
+            self._counts.move_to(pose[:2].copy())
+        self._counts.add(sensor[:2], ends)
         if len(self._scans) > self._most:
             self._scans.popleft()
             self._counts.forget_oldest()
@@ -73,9 +59,7 @@ class RollingSubmap:
     def lines(self) -> LineMap:
         """The lines of all scans, averaged where they lie on each other."""
         if self._lines is None:
-            points = np.concatenate([placed.points for placed in self._scans])
-            normals = np.concatenate([placed.normals for placed in self._scans])
-            squares = np.concatenate([placed.squares for placed in self._scans])
+            points, normals, squares, _ = map(np.concatenate, zip(*self._scans, strict=True))
             squares[~self.walls(points)] = -1
             self._lines = line_map_of_points(*averaged_lines(points, normals, squares))
         return self._lines
@@ -84,6 +68,6 @@ class RollingSubmap:
     def field(self) -> ScoreField:
         """The score field round the newest scans."""
         if self._field is None:
-            drawn = np.concatenate([placed.drawn for placed in self._scans])
+            drawn = np.concatenate([drawn for *_, drawn in self._scans])
             self._field = self._counts.field(drawn[self.walls(drawn)])
         return self._field

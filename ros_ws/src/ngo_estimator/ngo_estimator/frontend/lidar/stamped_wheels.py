@@ -81,18 +81,6 @@ class StampedWheels:
         begin_s, end_s = (stamp_s - self._origin_ns * 1e-9 - self.lag_s for stamp_s in (from_s, to_s))
         return _known(_motion(self._rows[: self._count], begin_s, end_s, calibration))
 
-    def counted(self, from_s: float, to_s: float) -> Array | None:
-        """The same without calibration."""
-        begin, end = self.pose_at(from_s), self.pose_at(to_s)
-        return None if begin is None or end is None else between(begin, end)
-
-    def paused(self, from_s: float, to_s: float, longest_s: float) -> bool:
-        """Whether the wheels told nothing for ``longest_s`` between two stamps (s since the epoch)."""
-        rows, origin_s = self._rows[: self._count, 0], self._origin_ns * 1e-9
-        inside = rows[(rows > from_s - origin_s) & (rows < to_s - origin_s)]
-        ends = np.concatenate(([from_s - origin_s], inside, [to_s - origin_s]))
-        return bool(np.diff(ends).max() > longest_s)
-
     def gaps(self, from_s: float, to_s: float, longest_s: float) -> tuple[Array, Array]:
         """The gaps between readings, of more than ``longest_s``, that reach into the time between two stamps (s since
         the epoch): their lengths ``(n,)``, and how much of each lies within that time ``(n,)``, s."""
