@@ -19,8 +19,8 @@ import numpy as np
 import torch
 
 from ngo_estimator.checkpoint import load_local, load_optimizer, load_place
+from ngo_estimator.data.relative_step import RelativeStep
 from ngo_estimator.frontend.lidar import mixture_lidar
-from ngo_estimator.frontend.lidar.lidar_step import LidarStep
 from ngo_estimator.geometry import se2
 from ngo_estimator.mapping import scan_map
 from ngo_estimator.mapping import scan_source as scan_sources
@@ -224,7 +224,7 @@ def log_errors(runs: DriveRuns, row: str) -> Measured:
         if not all(stamp in known for stamp in stamps):
             return Measured()
         poses = np.array([known[stamp] for stamp in stamps])
-    steps: list[LidarStep] = list(run.front.steps)
+    steps: list[RelativeStep] = list(run.front.steps)
     cells = drawn(KeyScans(), steps, trajectory.stamps_ns, poses)
     occupied = int((cells.trinary(*_THRESHOLDS).values == 100).sum())
     way_m = path_length_m(trajectory.poses_xyyaw)

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from scipy.spatial import KDTree
 
-from ngo_estimator.frontend.lidar.lidar_step import LidarStep
+from ngo_estimator.data.relative_step import RelativeStep
 from ngo_estimator.slam.localisation import Localiser
 from ngo_estimator.slam.map_origin import MapOrigin
 from ngo_estimator.slam.scan_matcher import ScanMatcher
@@ -98,7 +98,7 @@ def summary_of(starts: list[LogStart]) -> dict[str, Any]:
 
 
 def _start(
-    localiser: Localiser, errors: MapErrors, steps: list[LidarStep], way_m: np.ndarray, start: int, mapped: bool
+    localiser: Localiser, errors: MapErrors, steps: list[RelativeStep], way_m: np.ndarray, start: int, mapped: bool
 ) -> LogStart:
     localiser.reset()
     began, gone_m = time.process_time(), 0.0

@@ -15,8 +15,8 @@ from typing import Any, TypeVar
 import numpy as np
 
 from ngo_estimator.data.lidar_file import read_lidar_file
+from ngo_estimator.data.relative_step import RelativeStep
 from ngo_estimator.frontend.lidar import mixture_lidar
-from ngo_estimator.frontend.lidar.lidar_step import LidarStep
 from ngo_estimator.frontend.lidar.mixture_config import read_mixture_config
 from ngo_estimator.frontend.lidar.mixture_lidar import MixtureLidar
 from ngo_estimator.geometry.planar_motion import chained
@@ -84,7 +84,7 @@ def changed(config: Config, changes: Mapping[str, Any]) -> Config:
 class Front:
     """What odometry gave: its steps, the age of scans that it found, unsure steps, and its computing time."""
 
-    steps: list[LidarStep]
+    steps: list[RelativeStep]
     lag_s: float
     unsure: int
     took_s: float
@@ -122,7 +122,7 @@ class DriveRuns:
         if key not in self._fronts:
             settings = changed(read_mixture_config(self._weights), pipeline.odometry)
             odometry = MixtureLidar(settings, self.drive.mounting)
-            steps: list[LidarStep] = []
+            steps: list[RelativeStep] = []
             began = time.process_time()
             for record in self.drive.records(pipeline.wheels):
                 if isinstance(record, WheelPose):
@@ -151,7 +151,7 @@ class DriveRuns:
         return _Run(online, trajectory, np.stack(covariances), front, back_s)
 
 
-def _take(odometry: MixtureLidar, steps: list[LidarStep], at_end: bool) -> None:
+def _take(odometry: MixtureLidar, steps: list[RelativeStep], at_end: bool) -> None:
     while True:
         try:
             steps.extend(odometry.ready(at_end))

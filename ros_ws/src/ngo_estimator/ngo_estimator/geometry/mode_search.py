@@ -37,10 +37,6 @@ class Mixture:
         logs[-1] -= 2.0 * ratio[0] + ratio[1]
         return Mixture(self.means[first:], deviations, logs)
 
-    def log(self, pose: Array) -> float:
-        """Logarithm of the density of the hypothesis that is likeliest at a pose ``(3,)``."""
-        return float(_log(self.means, self.deviations, self.log_weights, pose))
-
     def logs(self, pose: Array) -> Array:
         """Logarithm ``(k,)`` of the density of each at a pose ``(3,)``."""
         result: Array = _logs(self.means, self.deviations, self.log_weights, pose)
@@ -88,11 +84,6 @@ def two_modes(
         (np.array((x + column * cell, y + row * cell, wrap(yaw + (a - turns) * step_rad))), total)
         for total, a, column, row in found
     ]
-
-
-@njit(cache=True)
-def _log(means: Array, deviations: Array, log_weights: Array, pose: Array) -> float:
-    return float(_logs(means, deviations, log_weights, pose).max())
 
 
 @njit(cache=True)

@@ -4,8 +4,8 @@ import math
 
 import numpy as np
 
+from ngo_estimator.data.relative_step import RelativeStep
 from ngo_estimator.frontend.intake.lidar_intake import LidarIntake
-from ngo_estimator.frontend.lidar.lidar_step import LidarStep
 from ngo_estimator.frontend.lidar.mixture_lidar import MixtureLidar
 from ngo_estimator.geometry.planar_motion import between, compose
 from ngo_estimator.geometry.scan_points import Mounting
@@ -21,10 +21,10 @@ _SILENT = range(3, 13)
 """Steps without wheels: without them other things are run."""
 
 
-def warm_up_odometry() -> list[LidarStep]:
+def warm_up_odometry() -> list[RelativeStep]:
     """Drive to and fro in a room of four walls, long enough that loops can be looked for; returns the steps."""
     odometry = LidarIntake(MixtureLidar(), lambda frame: Mounting(np.zeros(3)))
-    steps: list[LidarStep] = []
+    steps: list[RelativeStep] = []
     angles = np.linspace(-math.pi, math.pi, _RAYS, endpoint=False)
     pose, first = np.array([-4.0, 0.5, 0.1]), None
     for step in range(_STEPS):

@@ -7,8 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from ngo_estimator.data.relative_step import check_step
-from ngo_estimator.frontend.lidar.lidar_step import LidarStep
+from ngo_estimator.data.relative_step import RelativeStep, check_step
 from ngo_estimator.frontend.lidar.mixture_config import MixtureConfig
 from ngo_estimator.frontend.lidar.mixture_lidar import MixtureLidar
 from ngo_estimator.frontend.rejected_frames import DuplicateFrame, LateFrame, UnusableImage
@@ -45,7 +44,7 @@ def records(poses: np.ndarray, wheels: bool = True, room: np.ndarray = ROOM) -> 
     return result
 
 
-def fed(given: Iterable[LidarScan | WheelPose], lidar: MixtureLidar | None = None) -> list[LidarStep]:
+def fed(given: Iterable[LidarScan | WheelPose], lidar: MixtureLidar | None = None) -> list[RelativeStep]:
     lidar, steps = lidar or MixtureLidar(), []
     for record in given:
         if isinstance(record, WheelPose):
@@ -59,7 +58,7 @@ def fed(given: Iterable[LidarScan | WheelPose], lidar: MixtureLidar | None = Non
     return steps
 
 
-def off(steps: list[LidarStep], poses: np.ndarray) -> float:
+def off(steps: list[RelativeStep], poses: np.ndarray) -> float:
     last = between(between(poses[0], poses[-1]), steps[-1].odom_xyyaw)
     return math.hypot(last[0], last[1]) + abs(last[2])
 

@@ -10,8 +10,7 @@ import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
-from ngo_estimator.data.relative_step import check_step
-from ngo_estimator.frontend.lidar.lidar_step import LidarStep
+from ngo_estimator.data.relative_step import RelativeStep, check_step
 from ngo_estimator.frontend.lidar.mixture_lidar import MixtureLidar
 from ngo_estimator.frontend.rejected_frames import DuplicateFrame, LateFrame, UnusableImage
 from ngo_estimator.geometry.planar_motion import between, compose
@@ -48,7 +47,7 @@ def wheels(poses: np.ndarray, late_ns: int = 0) -> list[WheelPose]:
     return [WheelPose(BEGIN_NS + k * STEP_NS + late_ns, compose(first, each)) for k, each in enumerate(scaled)]
 
 
-def fed(odometry: MixtureLidar, records: Iterable[LidarScan | WheelPose], at_end: bool = True) -> list[LidarStep]:
+def fed(odometry: MixtureLidar, records: Iterable[LidarScan | WheelPose], at_end: bool = True) -> list[RelativeStep]:
     steps = []
     for record in records:
         if isinstance(record, WheelPose):
@@ -66,7 +65,7 @@ def merged(poses: np.ndarray, held: int) -> list[LidarScan | WheelPose]:
     return [each for _, _, each in sorted(keyed, key=lambda entry: entry[:2])]
 
 
-def off(steps: list[LidarStep], poses: np.ndarray) -> float:
+def off(steps: list[RelativeStep], poses: np.ndarray) -> float:
     last = between(between(poses[0], poses[-1]), steps[-1].odom_xyyaw)
     return math.hypot(last[0], last[1]) + abs(last[2])
 

@@ -72,9 +72,9 @@ def test_calibration_finds_scale_and_yaw_of_the_scanner() -> None:
     for _ in range(500):
         counted = np.array((noise.uniform(0.05, 0.25), 0.0, noise.uniform(-0.1, 0.1)))
         found = np.array((1.1 * counted[0] * math.cos(yaw), 1.1 * counted[0] * math.sin(yaw), counted[2]))
-        mixture.foretell(0.0, counted @ mixture.calibration.matrix, counted, 1.0)
+        mixture.foretell(0.0, counted @ mixture.calibration, counted, 1.0)
         mixture.learn(found, EXACT)
-    forward = mixture.calibration.matrix[0]
+    forward = mixture.calibration[0]
     assert abs(math.hypot(forward[0], forward[1]) - 1.1) < 0.02
     assert abs(math.atan2(forward[1], forward[0]) - yaw) < 0.01
 

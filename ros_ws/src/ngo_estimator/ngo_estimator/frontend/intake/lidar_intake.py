@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from ngo_estimator.data.relative_step import LARGEST_ODOMETRY
+from ngo_estimator.data.relative_step import LARGEST_ODOMETRY, RelativeStep
 from ngo_estimator.frontend.intake.floor_rays import FloorRays
 from ngo_estimator.frontend.intake.imu_turns import ImuTurns
 from ngo_estimator.frontend.intake.mounting_yaw import MountingYaw
@@ -15,7 +15,6 @@ from ngo_estimator.frontend.intake.single_wheels import SingleWheels
 from ngo_estimator.frontend.intake.stray_stamps import StrayStamps
 from ngo_estimator.frontend.intake.turns import Part, Turns
 from ngo_estimator.frontend.intake.wheel_clock import CorrectedWheels, WheelClock, WheelTruth
-from ngo_estimator.frontend.lidar.lidar_step import LidarStep
 from ngo_estimator.frontend.lidar.mixture_lidar import MixtureLidar
 from ngo_estimator.geometry.planar_motion import Array
 from ngo_estimator.geometry.scan_points import Mounting
@@ -163,7 +162,7 @@ class LidarIntake:
         self._mountings[scanner] = mounting
         self._scanners.setdefault(scanner, Scanner())
 
-    def ready(self, at_end: bool = False) -> Iterator[LidarStep]:
+    def ready(self, at_end: bool = False) -> Iterator[RelativeStep]:
         """The steps to all scans whose wheels are known by now; ``at_end`` nothing more comes.
 
         Raises:
@@ -180,7 +179,7 @@ class LidarIntake:
             said = self._wheels.said(step.stamp_ns - round(self.front_end.lag_s * 1e9))
             yield step if said is None else replace(step, robot_odom_xyyaw=said)
 
-    def _observe(self, step: LidarStep) -> None:
+    def _observe(self, step: RelativeStep) -> None:
         for scanner in self._scanners.values():
             scanner.moved(step.relative_xyyaw)
         if not step.unsure:

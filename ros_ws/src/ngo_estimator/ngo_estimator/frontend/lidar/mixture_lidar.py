@@ -9,9 +9,8 @@ from pathlib import Path
 
 import numpy as np
 
-from ngo_estimator.data.relative_step import LARGEST_ODOMETRY, RESTART_AFTER_NS
+from ngo_estimator.data.relative_step import LARGEST_ODOMETRY, RESTART_AFTER_NS, RelativeStep
 from ngo_estimator.frontend.lidar.even_stamps import UsualPeriod
-from ngo_estimator.frontend.lidar.lidar_step import LidarStep
 from ngo_estimator.frontend.lidar.mixture_config import MixtureConfig, read_mixture_config
 from ngo_estimator.frontend.lidar.mixture_odometry import MixtureOdometry
 from ngo_estimator.frontend.lidar.stamped_wheels import StampedWheels
@@ -149,7 +148,7 @@ class MixtureLidar:
             self._even_s = self._held[-1].stamp_ns * 1e-9
         self._held.clear()
 
-    def ready(self, at_end: bool = False) -> Iterator[LidarStep]:
+    def ready(self, at_end: bool = False) -> Iterator[RelativeStep]:
         """The steps to all scans whose wheels are known by now; ``at_end`` no more wheels come.
 
         Raises:
@@ -174,8 +173,8 @@ class MixtureLidar:
             or self._newest_ns * 1e-9 >= at_s + _WHEEL_WAIT_S
         )
 
-    def _step(self, scan: LidarScan, at_s: float) -> LidarStep | None:
-        last_s, wheels, calibration = self._last_s, self._wheels, self._core.mixture.calibration.matrix
+    def _step(self, scan: LidarScan, at_s: float) -> RelativeStep | None:
+        last_s, wheels, calibration = self._last_s, self._wheels, self._core.mixture.calibration
         if last_s is None:
             self._core.begin(self._key_scan(scan, None if wheels is None else self._sweep(scan, at_s, math.inf)))
             self._last_s = at_s
@@ -220,7 +219,7 @@ class MixtureLidar:
         offsets_s, twist = scan.ray_offsets_s, self._twist
         first_s, last_s = float(offsets_s.min()), float(offsets_s.max())
         if self._wheels is not None:
-            by_wheels = self._wheels.motion(at_s + first_s, at_s + last_s, self._core.mixture.calibration.matrix)
+            by_wheels = self._wheels.motion(at_s + first_s, at_s + last_s, self._core.mixture.calibration)
             twist = twist if by_wheels is None else arc_velocity(by_wheels, max(last_s - first_s, 1e-3))
         return Sweep(offsets_s, twist)
 

@@ -14,8 +14,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from ngo_estimator.data.relative_step import KeyScanStep
-from ngo_estimator.frontend.lidar.lidar_step import LidarStep
+from ngo_estimator.data.relative_step import KeyScanStep, RelativeStep
 from ngo_estimator.frontend.lidar.mixture_config import MixtureConfig
 from ngo_estimator.frontend.lidar.motion_mixture import ANY, MotionMixture
 from ngo_estimator.frontend.lidar.rolling_submap import RollingSubmap
@@ -109,7 +108,7 @@ class MixtureOdometry:
         gap: float,
         silent: bool,
         again: Callable[[Array], KeyScan | None] | None = None,
-    ) -> LidarStep:
+    ) -> RelativeStep:
         """The step to a scan.
 
         Args:
@@ -169,7 +168,7 @@ class MixtureOdometry:
 
     def _accepted(
         self, scan: KeyScan, pose: Array, covariance: Array, score: float, unsure: bool = False, segment: bool = False
-    ) -> LidarStep:
+    ) -> RelativeStep:
         """The step to a scan of a pose ``(3,)`` and its ``covariance``; ``score`` is how well it fits, 0 to 1."""
         config, last, key = self.config, self._pose, None
         step_covariance = turned_covariance(-last[2], covariance + self._covariance) + _LEAST
@@ -187,7 +186,7 @@ class MixtureOdometry:
             self._covariance = np.zeros((3, 3))
             self.mixture.filter.begin_at_key()
         nothing = np.zeros(0, np.float32)
-        step = LidarStep(
+        step = RelativeStep(
             stamp_ns=scan.stamp_ns,
             from_stamp_ns=self._last_ns,
             relative_xyyaw=between(last, pose),
@@ -196,7 +195,6 @@ class MixtureOdometry:
             odom_xyyaw=pose,
             motion_feature=nothing,
             place_code=nothing,
-            share=score,
             unsure=unsure,
             key=key,
             origin_scan=self._origin,
@@ -279,7 +277,7 @@ class MixtureOdometry:
                 modes.append(fit)
         if len(modes) == 1:
             return modes[0]
-        logs = np.array([mode.score / weight + self._prior(mode.walls).log(mode.pose) for mode in modes])
+        logs = np.array([mode.score / weight + self._prior(mode.walls).logs(mode.pose).max() for mode in modes])
         likelihoods = np.exp(np.minimum(logs - logs[0], 0.0))
         for mode, share in zip(modes[1:], likelihoods[1:] / likelihoods.sum(), strict=True):
             away = mode.pose - modes[0].pose
@@ -320,7 +318,7 @@ class MixtureOdometry:
         found = self._icp(few, start, mean, information, self.config.icp)
         # Along a direction that walls leave open a hypothesis counts by its weight, however sure it is.
         mode = _Mode(found, hypothesis, self._submap.field.score(few.points, found.pose), 0.0)
-        return replace(mode, total=mode.score + weight * self._prior(mode.walls, wide).log(found.pose))
+        return replace(mode, total=mode.score + weight * self._prior(mode.walls, wide).logs(found.pose).max())
 
     def _sharpened(self, scan: KeyScan, few: KeyScan, mode: _Mode) -> _Mode:
         """A mode of the ``few`` points, registered with all of the scan's under the hypothesis that is likeliest."""

@@ -25,29 +25,6 @@ from ngo_estimator.geometry.planar_motion import (
     wrap,
 )
 
-
-class WheelCalibration:
-    """What a motion that the wheels count is worth: a matrix, by running least squares.
-
-    It holds the scales of way and turn, the yaw of the scanner against its mounting, and the lever arm between both.
-    """
-
-    def __init__(self, config: MixtureConfig) -> None:
-        self._config = config
-        first = np.diag((config.certain_m, config.certain_m, config.certain_rad))
-        self._squares, self._products = first, first.copy()
-        self._matrix = np.eye(3)
-
-    @property
-    def matrix(self) -> Array:
-        """Expected motions are wheels' motions ``(3,)`` times this ``(3, 3)``."""
-        return self._matrix
-
-    def learn(self, motion: Array, found: Array, share: float) -> None:
-        """Take a motion ``(3,)`` of the wheels and what a match found; the ``share`` of it that is theirs counts."""
-        self._matrix = _calibrated(self._squares, self._products, motion, found, share, self._config.remembered_m)
-
-
 TIGHT, LOOSE, LAST, VELOCITY, NONE, ANY = range(6)
 
 _KNOWN = np.zeros((3, 3))
@@ -56,42 +33,36 @@ _KNOWN = np.zeros((3, 3))
 
 class MotionMixture:
     """Hypotheses: wheels that are good, wheels that are poor, the last displacement, the last velocity, none,
-    anything."""
+    anything.
+
+    Attributes:
+        weights: of the hypotheses ``(6,)``, as learned.
+        steps, deviations: mean motions ``(6, 3)`` as foretold last, and their deviations ``(6, 2)`` (m, rad).
+        calibration: expected motions are those that the wheels count ``(3,)`` times this ``(3, 3)``, by running least
+            squares: scales of way and turn, yaw of the scanner against its mounting, lever arm between both.
+        filter: of pose and velocity.
+    """
 
     def __init__(self, config: MixtureConfig) -> None:
         self._config = config
-        self._weights = np.array(config.first_weights)
+        self.weights = np.array(config.first_weights)
         self._factors = np.array(config.first_factors)[:, None].repeat(2, axis=1)  # of positions, of headings
         self._squares, self._least = self._factors**2, np.array(config.least_factors)
-        self._steps = np.zeros((6, 3))
+        self.steps = np.zeros((6, 3))
         self._usable = np.zeros(6, np.bool_)
-        self._base = self._deviations = np.ones((6, 2))
-        self._gap, self._yaw = 1.0, 0.0
+        self._base = self.deviations = np.ones((6, 2))
+        self._gap = self._last_gap = 1.0
+        self._yaw = 0.0
         self.filter = VelocityFilter()
         self._foretold = {k: self.filter.predicted(0.0, np.zeros(3), 1.0, np.zeros(2)) for k in (LAST, VELOCITY)}
-        self._last_gap = 1.0
-        self._raw: Array | None = None
-        self.calibration = WheelCalibration(config)
-
-    @property
-    def weights(self) -> Array:
-        """Weights ``(6,)`` of the hypotheses, as learned."""
-        return self._weights
-
-    @property
-    def steps(self) -> Array:
-        """Mean motions ``(6, 3)`` as foretold last."""
-        return self._steps
+        self._counted: Array | None = None
+        self._motions = np.diag((config.certain_m, config.certain_m, config.certain_rad))  # sums of squares, by wheels
+        self._products, self.calibration = self._motions.copy(), np.eye(3)
 
     @property
     def usable(self) -> list[int]:
         """The hypotheses that can be formed."""
         return [int(k) for k in np.flatnonzero(self._usable)]
-
-    @property
-    def deviations(self) -> Array:
-        """Deviations ``(6, 2)`` of their motions (m, rad)."""
-        return self._deviations
 
     def foretell(self, yaw: float, by_wheels: Array | None, counted: Array | None, gap: float) -> None:
         """Form the hypotheses of the next motion from a pose of heading ``yaw``; ``by_wheels`` ``(3,)`` is what the
@@ -100,17 +71,17 @@ class MotionMixture:
         ``gap`` is the time since the last scan in usual periods: what the wheels did not count is as much longer.
         """
         heard = by_wheels is not None
-        self._usable[:] = (self._weights > 0.0) & np.array((heard, heard, True, True, True, True))
-        self._steps[:] = 0.0
+        self._usable[:] = (self.weights > 0.0) & np.array((heard, heard, True, True, True, True))
+        self.steps[:] = 0.0
         self._last_gap, self._gap = self._gap, min(max(gap, 0.05), self._config.most_gap)
-        self._steps[LAST] = self._steps[ANY] = arc_motion(self.filter.velocity, self._last_gap)
-        self._steps[VELOCITY] = arc_motion(self.filter.velocity, self._gap)
-        self._raw = counted
+        self.steps[LAST] = self.steps[ANY] = arc_motion(self.filter.velocity, self._last_gap)
+        self.steps[VELOCITY] = arc_motion(self.filter.velocity, self._gap)
+        self._counted = counted
         if by_wheels is not None:
-            self._steps[TIGHT] = self._steps[LOOSE] = self._steps[ANY] = by_wheels
+            self.steps[TIGHT] = self.steps[LOOSE] = self.steps[ANY] = by_wheels
         c = self._config
         grow = c.still_m, c.way_share, c.turn_m, math.radians(c.still_deg), c.turn_share, c.way_rad
-        self._base, self._deviations = _grown(self._steps, self._factors, max(self._gap, 1.0), grow, c.anything)
+        self._base, self.deviations = _grown(self.steps, self._factors, max(self._gap, 1.0), grow, c.anything)
         self._yaw = yaw
         for k in (LAST, VELOCITY):
             self._expect(k, 0.0)
@@ -118,23 +89,21 @@ class MotionMixture:
     def _expect(self, hypothesis: int, share: float) -> None:
         """Where the velocity leads, which has become anything with a ``share`` of the probability."""
         periods = self._last_gap if hypothesis == LAST else self._gap
-        changes = np.sqrt(self._deviations[hypothesis] ** 2 + share * self._deviations[ANY] ** 2)
-        self._foretold[hypothesis] = self.filter.predicted(self._yaw, self._steps[hypothesis], periods, changes)
+        changes = np.sqrt(self.deviations[hypothesis] ** 2 + share * self.deviations[ANY] ** 2)
+        self._foretold[hypothesis] = self.filter.predicted(self._yaw, self.steps[hypothesis], periods, changes)
 
     def prior(self, pose: Array, covariance: Array, walls: Array | None, least: tuple[float, float]) -> Mixture:
         """The mixture of poses after ``pose`` ``(3,)`` with its covariance ``(3, 3)``, as ``walls`` ``(3, 3)`` would
         measure them; no deviation is below ``least`` (m, rad)."""
         joint = self._foretold[LAST][0], self._foretold[VELOCITY][0]
         walls = _KNOWN if walls is None else walls
-        means = _formed(
-            pose, self._steps, self._usable, self._deviations, covariance, *joint, walls, self._weights, least
-        )
+        means = _formed(pose, self.steps, self._usable, self.deviations, covariance, *joint, walls, self.weights, least)
         return Mixture(*means)
 
     @property
     def heaviest(self) -> int:
         """The hypothesis of the largest weight, of those that can be formed."""
-        return int(np.where(self._usable, self._weights, 0.0).argmax())
+        return int(np.where(self._usable, self.weights, 0.0).argmax())
 
     @property
     def trusts_wheels(self) -> bool:
@@ -156,7 +125,7 @@ class MotionMixture:
     def expected(self, hypothesis: int, pose: Array, covariance: Array) -> tuple[Array, Array]:
         """The pose ``(3,)`` that a hypothesis foretells after ``pose`` of ``covariance``, and its covariance."""
         repeated = self._config.repeated if hypothesis in (TIGHT, LOOSE) else 1.0
-        mean, spread = _expected(pose, covariance, self._steps[hypothesis], self._deviations[hypothesis], repeated)
+        mean, spread = _expected(pose, covariance, self.steps[hypothesis], self.deviations[hypothesis], repeated)
         if hypothesis in (LAST, VELOCITY):
             spread = self._foretold[hypothesis][0][:3, :3].copy()
         return mean, spread
@@ -164,14 +133,14 @@ class MotionMixture:
     def step_covariance(self, hypothesis: int) -> Array:
         """Covariance ``(3, 3)`` of a hypothesis' motion; errors of wheels repeat from step to step."""
         repeated = self._config.repeated if hypothesis in (TIGHT, LOOSE) else 1.0
-        result: Array = _diagonal(self._deviations[hypothesis], repeated)
+        result: Array = _diagonal(self.deviations[hypothesis], repeated)
         return result
 
     def foretold(self, pose: Array, covariance: Array) -> tuple[Array, Array]:
         """The pose ``(3,)`` after one of ``covariance`` ``(3, 3)`` by the likeliest hypothesis, with the covariance of
         all."""
-        best, total = compose(pose, self._steps[self.heaviest]), np.zeros((3, 3))
-        weights = np.where(self._usable, self._weights, 0.0)
+        best, total = compose(pose, self.steps[self.heaviest]), np.zeros((3, 3))
+        weights = np.where(self._usable, self.weights, 0.0)
         for k in map(int, np.flatnonzero(self._usable)):
             mean, spread = self.expected(k, pose, covariance)
             off = mean - best
@@ -183,7 +152,7 @@ class MotionMixture:
         """The robot went from ``before`` to ``pose``, both ``(3,)``, as a hypothesis has it; ``walls`` ``(3, 3)`` is
         what a match says of the step alone."""
         if hypothesis in (LAST, VELOCITY):
-            change = pose - compose(before, self._steps[hypothesis])
+            change = pose - compose(before, self.steps[hypothesis])
             self.filter.correct(self._foretold[hypothesis], change, covariance)
             return
         step = between(before, pose)
@@ -196,13 +165,14 @@ class MotionMixture:
         """Take the motion ``(3,)`` that a match found, with the covariance ``(3, 3)`` that walls alone leave it."""
         c = self._config
         numbers = c.learn_rate, c.learn_way, c.least_weight, c.most_factor
-        foretold = self._steps, self._usable, self._base, self._deviations
+        foretold = self.steps, self._usable, self._base, self.deviations
         known = self.filter.joint, (self._last_gap, self._gap)
         share, way = _learned(
-            *foretold, self._weights, self._squares, self._factors, self._least, step, walls, *known, numbers
+            *foretold, self.weights, self._squares, self._factors, self._least, step, walls, *known, numbers
         )
-        if share > 0.0 and self._raw is not None and abs(self._raw[2]) < c.learn_way and way < 2.0 * c.learn_way:
-            self.calibration.learn(self._raw, step, share)
+        counted, sums = self._counted, (self._motions, self._products)
+        if share > 0.0 and counted is not None and abs(counted[2]) < c.learn_way and way < 2.0 * c.learn_way:
+            self.calibration = _calibrated(*sums, counted, step, share, c.remembered_m)
 
 
 @njit(cache=True)
