@@ -22,7 +22,6 @@ from ngo_estimator.frontend.camera import local_odometry
 from ngo_estimator.frontend.camera.local_odometry import LocalOdometry
 from ngo_estimator.slam import online_trajectory
 from ngo_estimator.slam.online_trajectory import OnlineTrajectory
-from training.common import records
 from training.common.command_line import check_at_least, run_command
 from training.data.episodes import simulate
 from training.data.faults import SensedDrive, faulted
@@ -81,13 +80,12 @@ def main(arguments: Arguments) -> dict[str, Any]:
     """Measure, write everything, and return the JSON's content."""
     torch.set_num_threads(1)
     result = {
-        **records.record("faults", arguments),
+        **arguments.made("faults"),
         "split": arguments.split,
         "drives": arguments.mazes,
         "frames": arguments.frames,
         "tables": {world: _table(arguments, world) for world in arguments.worlds},
     }
-    result.pop("arguments")
     return arguments.publish("faults", result, faults_page.page(result))
 
 

@@ -12,7 +12,6 @@ ones repeat one module with one texture. Writes ``training/results/relocalisatio
 from __future__ import annotations
 
 import hashlib
-import json
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -25,7 +24,6 @@ from ngo_estimator.frontend.lidar import mixture_lidar
 from ngo_estimator.loops import pair_measurement
 from ngo_estimator.slam import localisation, online_trajectory, place_matcher, scan_matcher, scan_trajectory
 from ngo_estimator.slam.online_trajectory import OnlineTrajectory
-from training.common import records
 from training.common.command_line import check_at_least, run_command
 from training.data.batches import seen_from_first
 from training.data.kidnapped_drives import Features, kidnapped_drives
@@ -83,9 +81,7 @@ class Arguments(Folders):
 
 def main(arguments: Arguments) -> dict[str, Any]:
     """Measure, write the JSON, and return its content."""
-    record, path = records.record("relocalisation", arguments), arguments.out / "relocalisation.json"
-    result: dict[str, Any] = json.loads(path.read_text()) if path.exists() else {"tables": {}, "logs": {}}
-    made = {"command": record["command"], "revision": record["revision"]}
+    result, made = arguments.published("relocalisation") or {"tables": {}, "logs": {}}, arguments.made("relocalisation")
     if arguments.tables:
         found = {table: measured(arguments, table) for table in arguments.tables}
         kinds = {"tables": "mapped", "unmapped": "unmapped", "maps": "maps"}
@@ -96,8 +92,7 @@ def main(arguments: Arguments) -> dict[str, Any]:
             "logs": result["logs"],
         }
     if arguments.logs is not None:
-        of_logs = {**made, "command": f"{made['command']} --logs FOLDER"}
-        result["logs"] = {**of_logs, "starts": arguments.log_starts, "tables": _logs(arguments, arguments.logs)}
+        result["logs"] = {**made, "starts": arguments.log_starts, "tables": _logs(arguments, arguments.logs)}
     for table, rows in result["tables"].items():
         for row, numbers in rows.items():
             line = ", ".join(f"{name} {number['mean']:.4g}" for name, number in numbers.items())

@@ -44,7 +44,6 @@ _DRIVE_CODE, _ROW_CODE = (episodes, maze3d), (camera_rows, picture_odometry, pic
 class Arguments:
     """Settings of the measurement."""
 
-    world: Literal["camera"] = "camera"  # World to measure in.
     split: Literal["validation", "test"] = "test"  # Maps to measure on; settings are chosen on validation.
     seeds: int = 1  # Drives of each map.
     frames: int = 1000  # Frames of a drive.

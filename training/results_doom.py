@@ -24,7 +24,6 @@ from ngo_estimator.slam import online_trajectory
 from ngo_estimator.slam.online_trajectory import OnlineTrajectory
 from ngo_sim.episodes import Episode
 from training.baselines.graph_settings import load_settings
-from training.common import records
 from training.common.command_line import check_at_least, run_command
 from training.data.doom_drives import TEST_MAPS, TRAIN_MAPS, VALIDATION_MAPS, Map, map_drive
 from training.data.episodes import images_of
@@ -53,13 +52,13 @@ _FIRST_SEED = {"validation": 10_000, "test": 20_000}
 _MAPS = {"validation": VALIDATION_MAPS, "test": TEST_MAPS}
 _FIT_SEED, _FIT_MAPS = 5_000, 12
 _TRUTH = "truth"
+_WORLD = "doom"
 
 
 @dataclass(frozen=True)
 class Arguments(Folders):
     """Settings of the measurement."""
 
-    world: Literal["doom"] = "doom"  # World to measure in.
     split: Literal["validation", "test"] = "test"
     """Maps to measure on. Settings are chosen on validation; the test maps are for the final table alone."""
     seeds: int = 3  # Drives of each map.
@@ -73,12 +72,11 @@ class Arguments(Folders):
 def main(arguments: Arguments) -> dict[str, Any]:
     """Measure, write everything, and return the JSON's content."""
     torch.set_num_threads(1)
-    folder = arguments.weights / arguments.world
+    folder = arguments.weights / _WORLD
     drives = Drives(folder, arguments)
     rows = table_rows(arguments, drives)
     seeds = range(_FIRST_SEED[arguments.split], _FIRST_SEED[arguments.split] + arguments.seeds)
-    result: dict[str, Any] = {**records.record("results_doom", arguments), "path_m": {}, "returns": {}, "maps": {}}
-    result.pop("arguments")
+    result: dict[str, Any] = {**arguments.made("doom"), "path_m": {}, "returns": {}, "maps": {}}
     tracks: dict[str, dict[str, np.ndarray]] = {}
     for of in _MAPS[arguments.split][: arguments.maps or None]:
         name = map_name(of)
@@ -91,7 +89,7 @@ def main(arguments: Arguments) -> dict[str, Any]:
         tracks[name] = {row: measured.drawn["track"] for row, measured in first.items()}
     draw_levels(arguments.images / "doom_levels.png")
     draw(arguments.images / "results_doom_maps.png", tracks)
-    return arguments.publish(arguments.world, result, page(result, folder))
+    return arguments.publish(_WORLD, result, page(result, folder))
 
 
 def map_name(of: Map) -> str:
@@ -104,17 +102,17 @@ class Drives:
     """Drives and what the networks make of them, kept in files below ``folder``."""
 
     def __init__(self, weights: Path, arguments: Arguments) -> None:
-        self.folder = arguments.runs / arguments.world / "results"
+        self.folder = arguments.runs / _WORLD / "results"
         self._frames, self._weights = arguments.frames, weights
-        self.local, described = load_local(weights, arguments.world)
-        self.place, described_place = load_place(weights, arguments.world)
-        familiarity = load_familiarity(weights, arguments.world)
+        self.local, described = load_local(weights, _WORLD)
+        self.place, described_place = load_place(weights, _WORLD)
+        familiarity = load_familiarity(weights, _WORLD)
         self._watch = None if familiarity is None else FamiliarityWatch(familiarity, self.place.encoder)
         known = weights / f"{FAMILIARITY}.safetensors"
         watch = load_description(known, FAMILIARITY)["sha256"] if known.exists() else None
         self._networks = json.dumps([described["sha256"], described_place["sha256"]])
         self._identity = f"{self._networks} {watch}"
-        self._world: World = world_named(arguments.world)
+        self._world: World = world_named(_WORLD)
 
     def drive(self, of: Map, seed: int, drawn_start: bool = False) -> Episode:
         """A drive, which is simulated once."""
@@ -166,8 +164,8 @@ def table_rows(arguments: Arguments, drives: Drives) -> dict[str, Row]:
     """The rows of the table, and one of the drives themselves."""
     fitted = [drives.features(of, _FIT_SEED, drawn_start=True) for of in TRAIN_MAPS[:_FIT_MAPS]]
     actions = ActionsFit.of([(one["actions"], one["poses"]) for one in fitted])
-    settings = load_settings(arguments.out / f"{arguments.world}.gtsam.json")
-    core = OnlineTrajectory.load(arguments.weights / arguments.world, world=arguments.world)
+    settings = load_settings(arguments.out / f"{_WORLD}.gtsam.json")
+    core = OnlineTrajectory.load(arguments.weights / _WORLD, world=_WORLD)
     estimators = {
         "actions_only": (actions.estimate, str(actions.weights.tolist())),
         "local": (local, ""),
@@ -179,7 +177,7 @@ def table_rows(arguments: Arguments, drives: Drives) -> dict[str, Row]:
         estimate: Estimate = estimators[row][0](features)
         return Measured.of(errors_of(estimate, features["truth"]), track=estimate.poses[:, :2])
 
-    world, code = world_named(arguments.world), (doom_rows, online_trajectory)
+    world, code = world_named(_WORLD), (doom_rows, online_trajectory)
     rows = {row: Row(partial(scored, row=row), identity, code) for row, (_, identity) in estimators.items()}
     return {**rows, _TRUTH: Row(partial(_truth, world=world), "", (doom_rows,))}
 

@@ -12,7 +12,6 @@ The command writes ``training/results/explore.json``, ``docs/results_explore.md`
 ``docs/images/results_explore_*.png``. Kinds of places that it does not measure stay there as they were.
 """
 
-import json
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -70,8 +69,6 @@ Kind = Literal["mazes", "buildings", "plans", "good_wheels", "slipping_wheels", 
 class Arguments(Folders):
     """Settings of the table."""
 
-    world: Literal["explore"] = "explore"
-    """World to measure in."""
     worlds: tuple[Kind, ...] = ("mazes", "buildings")
     """Kinds of places: 2D mazes, drawn buildings, floor plans from files, and buildings with poses of its own."""
     plans: Path | None = None
@@ -115,11 +112,10 @@ class Place:
 
 def main(arguments: Arguments) -> dict[str, Any]:
     """Measure, write everything, and return the JSON's content."""
-    record = records.record("results", arguments)
     names = [name for name in ROWS if name in (*arguments.rows, BASE)]
     found: dict[str, Table] = {kind: _table(kind, names, arguments) for kind in arguments.worlds}
     settings = {name: getattr(arguments, name) for name in ("split", "scale", "most_s")}
-    measured = {"command": _command(arguments), "revision": record["revision"], "settings": settings}
+    measured = {**arguments.made("explore"), "settings": settings}
     images = draw_figures(arguments.images, found)
     result: dict[str, dict[str, Any]] = {
         "measured": dict.fromkeys(found, measured),
@@ -135,21 +131,9 @@ def main(arguments: Arguments) -> dict[str, Any]:
             for kind, table in found.items()
         },
     }
-    path = arguments.out / "explore.json"
-    before = json.loads(path.read_text()) if path.exists() else {}
+    before = arguments.published("explore")
     result = {part: {**before.get(part, {}), **kinds} for part, kinds in result.items()}
     return arguments.publish("explore", result, explore_page.page(result))
-
-
-def _command(arguments: Arguments) -> str:
-    chosen = f"--worlds {' '.join(arguments.worlds)} --count {arguments.count} --buildings {arguments.buildings}"
-    rows = "" if arguments.rows == ROWS else f" --rows {' '.join(arguments.rows)}"
-    scale = "" if arguments.scale == Arguments.scale else f" --scale {arguments.scale:g}"
-    own = "" if arguments.own_rows == Arguments.own_rows else f" --own-rows {' '.join(arguments.own_rows)}"
-    plans = "" if arguments.plans is None else " --plans FOLDER"
-    most = "" if arguments.most_s == Arguments.most_s else f" --most-s {arguments.most_s:g}"
-    split = "" if arguments.split == Arguments.split else f" --split {arguments.split}"
-    return f'make results WORLD=explore ARGS="{chosen}{rows}{own}{scale}{plans}{most}{split}"'
 
 
 def _table(kind: Kind, names: Sequence[str], arguments: Arguments) -> Table:

@@ -15,7 +15,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 
@@ -56,8 +56,6 @@ Correct = Callable[[GraphProblem], CorrectedGraph]
 class Arguments:
     """Settings of the table."""
 
-    world: Literal["graphs"] = "graphs"
-    """World to measure in."""
     graphs: tuple[str, ...] = GRAPHS
     """Graphs to measure; GRAPH_online has its loops in blocks, where robust goes on from its last solution."""
     folder: Path | None = None

@@ -10,7 +10,6 @@ What is measured is kept in ``runs/``, of a year each drive, so that the command
 stays as the JSON has it; more robots than two have tables of their own.
 """
 
-import json
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any, Literal
@@ -19,7 +18,6 @@ from ngo_estimator.frontend.lidar import mixture_lidar
 from ngo_estimator.loops.scan_settings import ScanGraphConfig
 from ngo_estimator.mapping import scan_map
 from ngo_estimator.slam import fleet, scan_trajectory, session, session_union
-from training.common import records
 from training.common.command_line import check_at_least
 from training.common.source_code import code_digest
 from training.data import fleet_drives as drives_module
@@ -48,8 +46,6 @@ _ALIASED_FIRST = 100  # of the seeds: aliased buildings are others
 class Arguments(Folders):
     """Settings of the tables."""
 
-    world: Literal["lifelong"] = "lifelong"
-    """World to measure in."""
     tables: tuple[Literal["fleet", "join", "year"], ...] = ("fleet", "join", "year")
     """Tables to measure."""
     buildings: int = 5
@@ -83,11 +79,10 @@ class Arguments(Folders):
 
 def main(arguments: Arguments) -> dict[str, Any]:
     """Measure, write everything, and return the JSON's content."""
-    record, path = records.record("results", arguments), arguments.out / "lifelong.json"
-    result: dict[str, Any] = json.loads(path.read_text()) if path.exists() else {"tables": {}}
+    result, made = arguments.published("lifelong") or {"tables": {}}, arguments.made("lifelong")
     for name in arguments.tables:
         settings = {setting: getattr(arguments, setting) for setting in ("split", *_SETTINGS[name])}
-        how = {"command": _command(arguments, name), "revision": record["revision"], "settings": settings}
+        how = {**made, "settings": settings}
         if name == "year":
             table = _years(arguments)
             for row in arguments.year_rows:
@@ -128,15 +123,6 @@ def _paired(found: dict[str, Table], name: str) -> dict[str, Any]:
         f"{_PREFIX[kind]}{as_one}": {"ate_ratio": mean_interval(two[:, 0] / two[:, 1]).as_json()}
         for kind, two in both.items()
     }
-
-
-def _command(arguments: Arguments, table: str) -> str:
-    given = {name: getattr(arguments, name) for name in _SETTINGS[table]}
-    words = {name: " ".join(value) if isinstance(value, tuple) else value for name, value in given.items()}
-    chosen = " ".join(f"--{name.replace('_', '-')} {value}" for name, value in words.items())
-    if arguments.split != "test":
-        chosen += f" --split {arguments.split}"
-    return f'make results WORLD=lifelong ARGS="--tables {table} {chosen}"'
 
 
 def _years(arguments: Arguments) -> Table:

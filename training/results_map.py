@@ -31,7 +31,6 @@ from ngo_estimator.ngo import whole_trajectory
 from ngo_estimator.ngo.neural_graph_optimizer import NeuralGraphOptimizer
 from ngo_estimator.ngo.whole_trajectory import optimize_offline
 from ngo_estimator.slam import scan_trajectory
-from training.common import records
 from training.common.command_line import check_at_least, run_command
 from training.data.batches import seen_from_first
 from training.data.episodes import GROUP, simulate
@@ -75,11 +74,9 @@ class Arguments(Folders):
 
 def main(arguments: Arguments) -> dict[str, Any]:
     """Measure, write everything, and return the JSON's content."""
-    record = records.record("results_map", arguments)
     skipped: list[str] = []
     result = {
-        "command": "python -m training.results_map" + (" --logs FOLDER" if arguments.logs else ""),
-        "revision": record["revision"],
+        **arguments.made("map"),
         "split": arguments.split,
         "mazes": arguments.mazes,
         "frames": arguments.frames,

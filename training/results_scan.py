@@ -65,7 +65,6 @@ _SCANNER_ROWS = ("ours_without_wheels",)
 class Arguments(Folders):
     """Settings of the lidar's results."""
 
-    world: Literal["scan"] = "scan"  # World to measure in.
     logs: Path | None = None
     """Folder of real logs (.bag, .log, .clf, gzipped or not), with relations as NAME.relations; none: left out."""
     buildings: int = 20  # Simulated buildings of each of the two tables.
@@ -96,7 +95,6 @@ class Arguments(Folders):
 
 def main(arguments: Arguments) -> dict[str, Any]:
     """Measure, write everything, and return the JSON's content."""
-    record = records.record("results", arguments)
     rows, skipped = _rows(arguments.rows)
     slip_rows = {name: row for name, row in rows.items() if name in _SLIP_ROWS}
     tables = {
@@ -110,9 +108,8 @@ def main(arguments: Arguments) -> dict[str, Any]:
     }
     found = bars(tables, scanners)
     logs = tables.pop("logs", {})
-    result = {
-        "command": _command(record["command"], bool(logs)),
-        "revision": record["revision"],
+    result: dict[str, Any] = {
+        **arguments.made("scan"),
         "settings": {name: getattr(arguments, name) for name in _SETTINGS},
         "logs": {name: {**_log_numbers(scored), **_published(name)} for name, scored in logs.items()},
         "tables": {name: _table_numbers(table) for name, table in tables.items()},
@@ -154,11 +151,6 @@ def _keep_published(result: dict[str, Any], published: Mapping[str, Any]) -> Non
 
 def _known(rows: Mapping[str, Any]) -> dict[str, Any]:
     return {row: cell for row, cell in rows.items() if row in ROWS}
-
-
-def _command(recorded: str, with_logs: bool) -> str:
-    flags = recorded.partition("training.results")[2].split() + (["--logs", "FOLDER"] if with_logs else [])
-    return " ".join(("make results WORLD=scan", *([f'ARGS="{" ".join(flags)}"'] if flags else [])))
 
 
 def _rows(names: Sequence[str]) -> tuple[dict[str, Row], list[str]]:

@@ -40,8 +40,6 @@ _ROWS = (*STRESS_ROWS, *FRONT_ABLATION)
 class Arguments(Folders):
     """Settings of the table."""
 
-    world: Literal["stress"] = "stress"
-    """World to measure in."""
     tables: tuple[Literal["logs", "buildings", "loops", "joins", "car"], ...] = ("logs",)
     """Tables to measure: changed logs, changed simulated buildings, loops of poor wheels, wrong joins, a car's loop."""
     logs: Path | None = None

@@ -65,7 +65,7 @@ def test_a_robot_that_estimates_its_poses_has_a_map_and_says_how_wrong_they_are(
     assert list(result["tables"]["slipping_wheels"]) == ["explore_lite"]
     entry = result["tables"]["slipping_wheels"]["explore_lite"]
     command = result["measured"]["slipping_wheels"]["command"]
-    assert all(part in command for part in (" --scale 0.3 ", " --most-s 12 ", " --split validation"))
+    assert all(part in command for part in (" --scale 0.3 ", " --most-s 12.0 ", " --split validation"))
     assert 0.0 < entry["ate_end_m"]["mean"] < 0.05 and entry["within"]["mean"] > 0.9
     assert entry["iou"]["mean"] > 0.1 and entry["path_m"]["mean"] > 0.1
     page = (tmp_path / "results_explore.md").read_text()

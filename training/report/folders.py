@@ -2,7 +2,7 @@
 
 import json
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
 
@@ -23,6 +23,15 @@ class Folders:
     def images(self) -> Path:
         """Folder of the figures."""
         return self.docs / "images"
+
+    def made(self, world: str) -> dict[str, str]:
+        """How a table comes about: the ``command``, FOLDER for folders of data that are given, and the ``revision``."""
+        record = records.record("results", self)
+        data = [field.name for field in fields(self) if field.default is None]
+        given = [name for name in data if getattr(self, name) is not None]
+        flags = [*record["command"].split()[3:], *(f"--{name} FOLDER" for name in given)]
+        chosen = f' ARGS="{" ".join(flags)}"' if flags else ""
+        return {"command": f"make results WORLD={world}{chosen}", "revision": record["revision"]}
 
     def published(self, name: str) -> dict[str, Any]:
         """The content of ``NAME.json``; empty where there is none."""
