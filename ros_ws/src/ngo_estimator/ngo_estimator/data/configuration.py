@@ -1,14 +1,31 @@
-"""Configuration dataclasses from the values of a JSON file."""
+"""Configuration dataclasses: from the values of a JSON file, and how they check their values."""
 
 import dataclasses
 import math
 import types
 import typing
+from collections.abc import Callable
 from typing import Any, TypeVar
 
 Config = TypeVar("Config")
 
 _LARGEST_INTEGER = 10**6  # of a network's sizes: a layer of a larger one may take all memory before it fails
+
+
+def check(config: object, names: str, expected: str, holds: Callable[[Any], bool]) -> None:
+    """Raise ``ValueError`` about the first of the named fields that does not hold what is expected.
+
+    Of a tuple each value must, and there must be one.
+    """
+    for name in names.split():
+        value = getattr(config, name)
+        if not (value != () and all(map(holds, value)) if isinstance(value, tuple) else holds(value)):
+            raise ValueError(f"{name} is {value!r}; expected {expected}")
+
+
+def check_positive(config: object, names: str) -> None:
+    """The same of fields that hold positive, finite numbers."""
+    check(config, names, "positive, finite", lambda x: 0.0 < x < math.inf)
 
 
 def config_from_dict(kind: type[Config], values: Any) -> Config:

@@ -13,6 +13,8 @@ import numpy as np
 from numba import njit
 from scipy.spatial import KDTree
 
+from ngo_estimator.data.configuration import check, check_positive
+
 _REACH = 3.0
 """Deviations around a point that have a likelihood."""
 _NEAR_DEPTH = 4  # of the blocks where a search near places begins: 1.3 m a side where a cell is 8 cm
@@ -73,20 +75,11 @@ class SearchConfig:
     """Blocks after which the search is cut short."""
 
     def __post_init__(self) -> None:
-        lengths = (self.resolution_m, self.heading_step_deg, self.deviation_m, self.separation_m, self.separation_deg)
-        if not all(0.0 < x < math.inf for x in lengths):
-            raise ValueError(
-                "resolution_m, heading_step_deg, deviation_m, separation_m, separation_deg are "
-                f"{lengths}; expected positive numbers"
-            )
-        if not (0 <= self.depth <= 10 and self.most_blocks >= 1):
-            raise ValueError(
-                f"depth, most_blocks are {self.depth}, {self.most_blocks}; expected 0 to 10, and at least 1"
-            )
-        if not (0.0 <= self.least_response < 1.0 and 0.0 <= self.least_second <= 1.0):
-            raise ValueError(
-                f"least_response, least_second are {self.least_response}, {self.least_second}; expected shares of one"
-            )
+        check_positive(self, "resolution_m heading_step_deg deviation_m separation_m separation_deg")
+        check(self, "depth", "0 to 10", lambda x: 0 <= x <= 10)
+        check(self, "most_blocks", "at least 1", lambda x: x >= 1)
+        check(self, "least_response", "a share of 0 to below 1", lambda x: 0.0 <= x < 1.0)
+        check(self, "least_second", "a share of 0 to 1", lambda x: 0.0 <= x <= 1.0)
 
 
 def pooled_grid(config: SearchConfig, points: np.ndarray) -> PooledGrid:

@@ -12,6 +12,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from ngo_estimator.data.configuration import check, check_positive
 from ngo_estimator.geometry.line_map import CELL_M, LineMap
 from ngo_estimator.geometry.planar_motion import Array, inverted, wrap
 
@@ -41,25 +42,15 @@ class IcpConfig:
     normal_deviations: float = 2.0
 
     def __post_init__(self) -> None:
-        if self.steps < 1 or self.annealing_steps < 1:
-            raise ValueError(f"steps, annealing_steps are {self.steps}, {self.annealing_steps}; expected at least 1")
-        if not 0.0 < self.last_kernel_m <= self.first_kernel_m < math.inf:
-            raise ValueError(
-                f"first_kernel_m, last_kernel_m are {self.first_kernel_m}, {self.last_kernel_m}; expected positive "
-                "lengths, the last no larger than the first"
-            )
-        if not 0.0 < self.last_gate_m <= self.first_gate_m <= CELL_M:
-            raise ValueError(
-                f"first_gate_m, last_gate_m are {self.first_gate_m}, {self.last_gate_m}; expected positive lengths, "
-                f"the last no larger than the first, the first at most {CELL_M}"
-            )
-        if not (0.0 < self.facing_deg <= 90.0 and self.correlation >= 1.0 and 0.0 <= self.normal_deviations < math.inf):
-            raise ValueError(
-                f"facing_deg, correlation, normal_deviations are {self.facing_deg}, {self.correlation}, "
-                f"{self.normal_deviations}; expected over 0 to 90, at least 1, and at least 0"
-            )
-        if not (0.0 < self.fit_m < math.inf and 0.0 < self.noise_m < math.inf):
-            raise ValueError(f"fit_m, noise_m are {self.fit_m}, {self.noise_m}; expected positive lengths")
+        check(self, "steps annealing_steps", "at least 1", lambda x: x >= 1)
+        check_positive(self, "first_kernel_m last_kernel_m first_gate_m last_gate_m fit_m noise_m")
+        first_kernel_m, first_gate_m = self.first_kernel_m, self.first_gate_m
+        check(self, "last_kernel_m", f"at most first_kernel_m, {first_kernel_m}", lambda x: x <= first_kernel_m)
+        check(self, "last_gate_m", f"at most first_gate_m, {first_gate_m}", lambda x: x <= first_gate_m)
+        check(self, "first_gate_m", f"at most {CELL_M}", lambda x: x <= CELL_M)
+        check(self, "facing_deg", "over 0 to 90", lambda x: 0.0 < x <= 90.0)
+        check(self, "correlation", "at least 1", lambda x: x >= 1.0)
+        check(self, "normal_deviations", "finite, from 0 on", lambda x: 0.0 <= x < math.inf)
 
 
 @dataclass(frozen=True, eq=False)

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 from numba import njit
 
+from ngo_estimator.data.configuration import check, check_positive
 from ngo_estimator.geometry.key_scan import KeyScan
 from ngo_estimator.geometry.planar_motion import Array, rotated, transformed
 
@@ -47,21 +48,11 @@ class ScanPointsConfig:
     edge_on: float = 0.08
 
     def __post_init__(self) -> None:
-        if not 0.0 < self.spacing_m < math.inf or self.most_points < 10 or self.neighbours < 1:
-            raise ValueError(
-                f"spacing_m, most_points, neighbours are {self.spacing_m}, {self.most_points}, {self.neighbours}; "
-                "expected a positive length, at least 10 and at least 1"
-            )
-        if not all(0.0 <= noise < math.inf for noise in (self.spacing_noise, self.thickness_noise)):
-            raise ValueError(
-                f"spacing_noise, thickness_noise are {self.spacing_noise}, {self.thickness_noise}; expected numbers of "
-                "at least 0"
-            )
-        if not (0.0 < self.thickness_m < math.inf and 0.0 <= self.thickness_share < 1.0 and 0.0 <= self.edge_on < 1.0):
-            raise ValueError(
-                f"thickness_m, thickness_share, edge_on are {self.thickness_m}, {self.thickness_share}, "
-                f"{self.edge_on}; expected a positive length and two shares below 1"
-            )
+        check_positive(self, "spacing_m thickness_m")
+        check(self, "most_points", "at least 10", lambda x: x >= 10)
+        check(self, "neighbours", "at least 1", lambda x: x >= 1)
+        check(self, "spacing_noise thickness_noise", "finite, from 0 on", lambda x: 0.0 <= x < math.inf)
+        check(self, "thickness_share edge_on", "a share of 0 to below 1", lambda x: 0.0 <= x < 1.0)
 
 
 @dataclass(frozen=True, eq=False)

@@ -12,6 +12,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from ngo_estimator.data.configuration import check, check_positive
+
 
 @dataclass(frozen=True)
 class RegistrationConfig:
@@ -33,21 +35,12 @@ class RegistrationConfig:
     odometry: bool = True
 
     def __post_init__(self) -> None:
-        if self.rays < 8 or not 0.0 < self.field_of_view_deg <= 360.0:
-            raise ValueError(
-                f"rays, field_of_view_deg are {self.rays}, {self.field_of_view_deg}; expected at least 8, and over 0 "
-                "to 360"
-            )
-        if not 0.0 < self.noise_m <= self.widest_tolerance_m < math.inf:
-            raise ValueError(
-                f"noise_m, widest_tolerance_m are {self.noise_m}, {self.widest_tolerance_m}; expected positive "
-                "distances, the noise no larger than the tolerance"
-            )
-        if not (0.0 <= self.noise_share < 1.0 and 0.0 < self.last_tolerance < math.inf):
-            raise ValueError(
-                f"noise_share, last_tolerance are {self.noise_share}, {self.last_tolerance}; expected a share of 0 to "
-                "below 1, and a positive number of deviations"
-            )
+        check(self, "rays", "at least 8", lambda x: x >= 8)
+        check(self, "field_of_view_deg", "over 0 to 360", lambda x: 0.0 < x <= 360.0)
+        check_positive(self, "noise_m widest_tolerance_m last_tolerance")
+        widest_m = self.widest_tolerance_m
+        check(self, "noise_m", f"no larger than the tolerance, {widest_m}", lambda x: x <= widest_m)
+        check(self, "noise_share", "a share of 0 to below 1", lambda x: 0.0 <= x < 1.0)
 
     @property
     def angles_rad(self) -> Tensor:

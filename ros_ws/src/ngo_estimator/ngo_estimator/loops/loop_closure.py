@@ -15,6 +15,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from ngo_estimator.data.configuration import check
 from ngo_estimator.geometry import se2
 from ngo_estimator.geometry.scan_registration import Scans
 from ngo_estimator.geometry.se2 import library
@@ -50,26 +51,18 @@ class LoopSearch:
     """The same of the heading (rad); see ``may_show_one_place``."""
 
     def __post_init__(self) -> None:
-        if min(self.per_pose, self.most, self.min_separation) < 1 or self.min_apart < 0:
-            raise ValueError(
-                f"per_pose, most, min_separation, min_apart are {self.per_pose}, {self.most}, {self.min_separation}, "
-                f"{self.min_apart}; expected at least 1, 1, 1, 0"
-            )
-        if not 1 <= self.views <= len(VIEWS):
-            raise ValueError(f"views is {self.views}; expected 1 to {len(VIEWS)}")
-        if not 0.0 <= self.least_belief < 1.0:
-            raise ValueError(f"least_belief is {self.least_belief}; expected 0 (loops are not judged) to below 1")
+        check(self, "per_pose most min_separation", "at least 1", lambda x: x >= 1)
+        check(self, "min_apart registrations overlaps", "at least 0", lambda x: x >= 0)
+        check(self, "views", f"1 to {len(VIEWS)}", lambda x: 1 <= x <= len(VIEWS))
+        check(self, "least_belief", "0 (loops are not judged) to below 1", lambda x: 0.0 <= x < 1.0)
         if min(self.drift_m, self.drift_rad) < 0.0 or (self.drift_m > 0.0) != (self.drift_rad > 0.0):
             raise ValueError(
                 f"drift_m, drift_rad are {self.drift_m}, {self.drift_rad}; expected two positive numbers, or 0 and 0 "
                 "(candidates from anywhere)"
             )
-        if self.registrations < 0:
-            raise ValueError(f"registrations is {self.registrations}; expected 0 (none) or more")
-        if self.overlaps < 0 or (self.overlaps and not self.registrations):
+        if self.overlaps and not self.registrations:
             raise ValueError(
-                f"overlaps, registrations are {self.overlaps}, {self.registrations}; expected 0 (none) or more, and "
-                "with overlaps steps in which they are registered"
+                f"overlaps is {self.overlaps}, registrations 0; expected steps in which they are registered"
             )
 
 

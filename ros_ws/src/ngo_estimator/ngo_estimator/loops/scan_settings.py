@@ -1,9 +1,9 @@
 """All settings of a lidar's back end: where loops are looked for, which are believed, and when all is optimised."""
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass, field
 
+from ngo_estimator.data.configuration import check
 from ngo_estimator.geometry.branch_and_bound import SearchConfig
 
 
@@ -60,15 +60,15 @@ class ScanLoopConfig:
 
     def __post_init__(self) -> None:
         counts = "every place_step submap_keys source_keys search_points most_submaps"
-        _check(self, counts, "at least 1", lambda x: x >= 1)
-        _check(self, "most_per_key least_agreeing neighbour_keys", "at least 0", lambda x: x >= 0)
+        check(self, counts, "at least 1", lambda x: x >= 1)
+        check(self, "most_per_key least_agreeing neighbour_keys", "at least 0", lambda x: x >= 0)
         ratios = "least_response most_second least_on_lines most_seen_through"
-        _check(self, ratios, "a ratio from 0 to 1", lambda x: 0.0 <= x <= 1.0)
+        check(self, ratios, "a ratio from 0 to 1", lambda x: 0.0 <= x <= 1.0)
         lengths = "least_gap_m reach_m range_m agreement_m agreement_deg agreeing_per_deviation"
-        _check(self, lengths, "a finite number from 0 on", lambda x: 0.0 <= x < math.inf)
-        _check(self, "search_factor", "a finite number of at least 1", lambda x: 1.0 <= x < math.inf)
-        _check(self, "most_disagreement", "a number from 0 on", lambda x: x >= 0.0)
-        _check(self, "source_keys", f"at most submap_keys, {self.submap_keys}", lambda x: x <= self.submap_keys)
+        check(self, lengths, "a finite number from 0 on", lambda x: 0.0 <= x < math.inf)
+        check(self, "search_factor", "a finite number of at least 1", lambda x: 1.0 <= x < math.inf)
+        check(self, "most_disagreement", "a number from 0 on", lambda x: x >= 0.0)
+        check(self, "source_keys", f"at most submap_keys, {self.submap_keys}", lambda x: x <= self.submap_keys)
 
 
 @dataclass(frozen=True)
@@ -91,12 +91,12 @@ class WindowConfig:
     """Half width where a covariance is given, within the same limits (deviations)."""
 
     def __post_init__(self) -> None:
-        _check(self, "least_m", f"a positive number up to most_m, {self.most_m}", lambda x: 0.0 < x <= self.most_m)
-        _check(self, "most_m", "a finite number", math.isfinite)
-        _check(self, "least_deg", f"positive, up to most_deg, {self.most_deg}", lambda x: 0.0 < x <= self.most_deg)
-        _check(self, "most_deg", "at most 180", lambda x: x <= 180.0)
-        _check(self, "share deg_per_m", "a number from 0 on", lambda x: x >= 0.0)
-        _check(self, "deviations", "a positive number", lambda x: x > 0.0)
+        check(self, "least_m", f"a positive number up to most_m, {self.most_m}", lambda x: 0.0 < x <= self.most_m)
+        check(self, "most_m", "a finite number", math.isfinite)
+        check(self, "least_deg", f"positive, up to most_deg, {self.most_deg}", lambda x: 0.0 < x <= self.most_deg)
+        check(self, "most_deg", "at most 180", lambda x: x <= 180.0)
+        check(self, "share deg_per_m", "a number from 0 on", lambda x: x >= 0.0)
+        check(self, "deviations", "a positive number", lambda x: x > 0.0)
 
 
 @dataclass(frozen=True)
@@ -128,16 +128,8 @@ class ScanGraphConfig:
     """Key scans from which on, at least 100, old ones leave the graph where newer ones show the same. Poses stay."""
 
     def __post_init__(self) -> None:
-        _check(self, "keys_between", "at least 1", lambda x: x >= 1)
-        _check(self, "most_scans", "at least 100", lambda x: x >= 100)
-        _check(self, "agreeing_beyond", "at least 0", lambda x: x >= 0)
+        check(self, "keys_between", "at least 1", lambda x: x >= 1)
+        check(self, "most_scans", "at least 100", lambda x: x >= 100)
+        check(self, "agreeing_beyond", "at least 0", lambda x: x >= 0)
         positive = "surprise surprise_m redundant kernel step_m step_deg"
-        _check(self, positive, "a positive number", lambda x: 0.0 < x < math.inf)
-
-
-def _check(config: object, names: str, expected: str, holds: Callable[[float], bool]) -> None:
-    """Raise ``ValueError`` about the first of the named settings that does not hold what is expected."""
-    for name in names.split():
-        value = getattr(config, name)
-        if not holds(value):
-            raise ValueError(f"{name} is {value}; expected {expected}")
+        check(self, positive, "a positive number", lambda x: 0.0 < x < math.inf)

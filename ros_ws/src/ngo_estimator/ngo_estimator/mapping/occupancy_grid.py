@@ -15,6 +15,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from ngo_estimator.data.configuration import check, check_positive
 from ngo_estimator.mapping.range_scan import Array, RangeScan
 
 UNKNOWN = -1
@@ -46,10 +47,8 @@ class OccupancyConfig:
     free: float = 0.25
 
     def __post_init__(self) -> None:
-        if not (0.0 < self.hit < math.inf and 0.0 < self.passed < math.inf and self.settled > 0.0):
-            raise ValueError(
-                f"hit, passed, settled are {self.hit}, {self.passed}, {self.settled}; expected positive log odds"
-            )
+        check_positive(self, "hit passed")
+        check(self, "settled", "positive", lambda x: x > 0.0)
         if not 0.0 <= self.free < self.occupied <= 1.0:
             raise ValueError(f"free, occupied are {self.free}, {self.occupied}; expected 0 <= free < occupied <= 1")
 

@@ -9,6 +9,7 @@ from functools import partial
 
 import numpy as np
 
+from ngo_estimator.data.configuration import check, check_positive
 from ngo_estimator.data.relative_step import RESTART_AFTER_NS, RelativeStep
 from ngo_estimator.data.state_arrays import Arrays, StateError, flat, part, require, split, taken, under
 from ngo_estimator.mapping.occupancy_grid import MapTooLarge, OccupancyConfig, OccupancyGrid, OccupancyMap
@@ -42,21 +43,8 @@ class ScanMapConfig:
     most_waiting: int = 5000
 
     def __post_init__(self) -> None:
-        lengths = (
-            self.resolution_m,
-            self.spacing_m,
-            self.spacing_deg,
-            self.place_m,
-            self.place_deg,
-            self.moved_cells,
-            self.epoch_s,
-        )
-        numbers = self.most_at_a_place, self.most_waiting
-        if not all(0.0 < length < math.inf for length in lengths) or min(numbers) < 1:
-            raise ValueError(
-                f"resolution_m, spacing_m, spacing_deg, place_m, place_deg, moved_cells, epoch_s are {lengths} and "
-                f"most_at_a_place, most_waiting are {numbers}; expected positive numbers"
-            )
+        check_positive(self, "resolution_m spacing_m spacing_deg place_m place_deg moved_cells epoch_s")
+        check(self, "most_at_a_place most_waiting", "at least 1", lambda x: x >= 1)
 
 
 @dataclass(frozen=True)

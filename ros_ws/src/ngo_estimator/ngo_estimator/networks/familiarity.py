@@ -12,6 +12,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor, nn
 
+from ngo_estimator.data.configuration import check, check_positive
 from ngo_estimator.networks.place_encoder import PlaceEncoder
 
 DISTANCES = ("look", "motion", "told", "change")
@@ -57,21 +58,12 @@ class FamiliarityConfig:
     memory: int = 16
 
     def __post_init__(self) -> None:
-        if min(self.look_size, self.motion_size, self.memory) < 1 or self.actions < 0:
-            raise ValueError(
-                f"look_size, motion_size, memory, actions are {self.look_size}, {self.motion_size}, {self.memory}, "
-                f"{self.actions}; expected at least 1, 1, 1, 0"
-            )
-        if len(self.limits) != len(DISTANCES) or not min(self.limits) > 0.0:
-            raise ValueError(f"limits is {self.limits}; expected {len(DISTANCES)} positive numbers")
-        if not (min(self.told_std) > 0.0 and min(self.told_share) >= 0.0 and max(self.told_share) <= 1.0):
-            raise ValueError(
-                f"told_std, told_share are {self.told_std}, {self.told_share}; expected positive numbers, and shares"
-            )
-        if not (self.disagreement > 0.0 and self.usual_change > 0.0):
-            raise ValueError(
-                f"disagreement, usual_change are {self.disagreement}, {self.usual_change}; expected positive numbers"
-            )
+        check(self, "look_size motion_size memory", "at least 1", lambda x: x >= 1)
+        check(self, "actions", "at least 0", lambda x: x >= 0)
+        check_positive(self, "limits told_std disagreement usual_change")
+        check(self, "told_share", "shares of 0 to 1", lambda x: 0.0 <= x <= 1.0)
+        if len(self.limits) != len(DISTANCES):
+            raise ValueError(f"limits is {self.limits}; expected {len(DISTANCES)} numbers")
 
     @property
     def told_size(self) -> int:

@@ -6,6 +6,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn.functional import one_hot
 
+from ngo_estimator.data.configuration import check, check_positive
 from ngo_estimator.data.images import ImageFormat, to_network
 from ngo_estimator.networks.flownet import FlowNetConvolutions
 from ngo_estimator.networks.odometry_smoothing import OdometrySmoother, SmootherConfig
@@ -49,26 +50,10 @@ class LocalPoseConfig:
     memory: SmootherConfig | None = None
 
     def __post_init__(self) -> None:
-        if not 0.0 < self.width <= 2.0:
-            raise ValueError(f"width is {self.width}; expected over 0 and at most 2 (1 is FlowNetS)")
-        if self.actions < 0 or self.feature_size < 1 or self.hidden_size < 1:
-            raise ValueError(
-                f"actions, feature_size, hidden_size are {self.actions}, {self.feature_size}, {self.hidden_size}; "
-                "expected at least 0, 1, 1"
-            )
-        if self.action_history < 1 or self.fusion_size < 1:
-            raise ValueError(
-                f"action_history, fusion_size are {self.action_history}, {self.fusion_size}; expected at least 1 (the "
-                "latest action), 1"
-            )
-        if not self.period_s > 0.0:
-            raise ValueError(f"period_s is {self.period_s}; expected a positive time")
-        if min(self.relative_std) <= 0.0:
-            raise ValueError(f"relative_std is {self.relative_std}; expected three positive numbers")
-        if min(self.deviation_scale) <= 0.0:
-            raise ValueError(f"deviation_scale is {self.deviation_scale}; expected three positive numbers")
-        if min(self.twist_scale) <= 0.0:
-            raise ValueError(f"twist_scale is {self.twist_scale}; expected three positive numbers")
+        check(self, "width", "over 0 and at most 2 (1 is FlowNetS)", lambda x: 0.0 < x <= 2.0)
+        check(self, "actions", "at least 0", lambda x: x >= 0)
+        check(self, "feature_size hidden_size action_history fusion_size", "at least 1", lambda x: x >= 1)
+        check_positive(self, "period_s relative_std deviation_scale twist_scale")
         if self.symmetric and sorted(self.mirrored_actions) != list(range(self.actions)):
             raise ValueError(
                 f"mirrored_actions is {self.mirrored_actions}; expected each of the {self.actions} actions once"

@@ -10,6 +10,8 @@ import torch
 from torch import Tensor, nn
 from torch.nn.functional import pad
 
+from ngo_estimator.data.configuration import check, check_positive
+
 _UNIT = 0.1
 """Correction of a step by a head that says 1, in units of ``relative_std``."""
 _LARGEST_INPUT = 10.0
@@ -37,17 +39,8 @@ class SmootherConfig:
     deviation_scale: tuple[float, float, float] = (1.0, 1.0, 1.0)
 
     def __post_init__(self) -> None:
-        if min(self.motion_feature_size, self.width, *self.dilations, len(self.dilations)) < 1:
-            raise ValueError(
-                f"motion_feature_size, width, dilations are {self.motion_feature_size}, {self.width}, "
-                f"{self.dilations}; expected at least 1, and a positive number for each convolution"
-            )
-        if min(self.relative_std) <= 0.0:
-            raise ValueError(f"relative_std is {self.relative_std}; expected three positive numbers")
-        if not self.largest > 0.0:
-            raise ValueError(f"largest is {self.largest}; expected a positive number")
-        if min(self.deviation_scale) <= 0.0:
-            raise ValueError(f"deviation_scale is {self.deviation_scale}; expected three positive numbers")
+        check(self, "motion_feature_size width dilations", "at least 1", lambda x: x >= 1)
+        check_positive(self, "relative_std largest deviation_scale")
 
     @property
     def reach(self) -> int:

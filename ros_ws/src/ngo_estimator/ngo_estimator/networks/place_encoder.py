@@ -11,6 +11,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn.functional import leaky_relu, normalize
 
+from ngo_estimator.data.configuration import check, check_positive
 from ngo_estimator.data.images import ImageFormat, to_network
 from ngo_estimator.geometry.scan_registration import RegistrationConfig, Scans, register
 from ngo_estimator.networks.flownet import FlowNetConvolutions
@@ -39,14 +40,10 @@ class PlaceConfig:
     least_sure: float = 0.0
 
     def __post_init__(self) -> None:
-        if not 0.0 < self.width <= 2.0:
-            raise ValueError(f"width is {self.width}; expected over 0 and at most 2 (1 is FlowNetS)")
-        if self.offset_scale_m <= 0.0:
-            raise ValueError(f"offset_scale_m is {self.offset_scale_m}; expected a positive distance")
-        if min(self.code_size, self.embedding_size, self.pair_hidden_size) < 1:
-            raise ValueError("code_size, embedding_size and pair_hidden_size must be at least 1")
-        if not 0.0 <= self.least_sure <= 1.0:
-            raise ValueError(f"least_sure is {self.least_sure}; expected a share of 0 to 1")
+        check(self, "width", "over 0 and at most 2 (1 is FlowNetS)", lambda x: 0.0 < x <= 2.0)
+        check_positive(self, "offset_scale_m")
+        check(self, "code_size embedding_size pair_hidden_size", "at least 1", lambda x: x >= 1)
+        check(self, "least_sure", "a share of 0 to 1", lambda x: 0.0 <= x <= 1.0)
         if self.registration is None or self.sees_ranges:
             return
         if not self.image.has_depth:

@@ -15,6 +15,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
+from ngo_estimator.data.configuration import check, check_positive
 from ngo_estimator.loops.loop_closure import Loops, LoopSearch, find_loops
 from ngo_estimator.loops.overlaps import find_overlaps
 from ngo_estimator.networks.odometry_smoothing import OdometrySmoother, SmootherConfig
@@ -74,13 +75,8 @@ class NeuralGraphOptimizerConfig:
     """Factor of a pose's covariance, fitted to the errors on validation data."""
 
     def __post_init__(self) -> None:
-        if self.attention not in ("softmax", "sum"):
-            raise ValueError(f"attention is {self.attention!r}; expected 'softmax' or 'sum'")
-        if self.iterations < 1 or not self.dilations or min(self.dilations) < 1:
-            raise ValueError(
-                f"iterations, dilations are {self.iterations}, {self.dilations}; expected at least 1, and a positive "
-                "number for each convolution"
-            )
+        check(self, "attention", "'softmax' or 'sum'", lambda form: form in ("softmax", "sum"))
+        check(self, "iterations dilations", "at least 1", lambda x: x >= 1)
         if not (self.loops or self.network):
             raise ValueError(f"loops, network are {self.loops}, {self.network}; expected at least one of them")
         if self.smoother is not None and self.smoother.motion_feature_size != self.aggregation.motion_feature_size:
@@ -88,10 +84,7 @@ class NeuralGraphOptimizerConfig:
                 f"the smoother takes {self.smoother.motion_feature_size} motion features; expected "
                 f"{self.aggregation.motion_feature_size}, as the aggregation"
             )
-        if min(self.correction_std) <= 0.0:
-            raise ValueError(f"correction_std is {self.correction_std}; expected three positive numbers")
-        if not 0.0 < self.covariance_scale < math.inf:
-            raise ValueError(f"covariance_scale is {self.covariance_scale}; expected a positive number")
+        check_positive(self, "correction_std covariance_scale")
 
     @property
     def context(self) -> int:

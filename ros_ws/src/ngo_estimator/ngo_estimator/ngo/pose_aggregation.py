@@ -5,6 +5,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor, nn
 
+from ngo_estimator.data.configuration import check
 from ngo_estimator.geometry import se2
 
 _LARGEST_INPUT = 10.0
@@ -25,12 +26,8 @@ class PoseAggregationConfig:
     relative_std: tuple[float, float, float] = (1.0, 1.0, 1.0)
 
     def __post_init__(self) -> None:
-        if not 0 <= self.halvings <= 6:
-            raise ValueError(f"halvings is {self.halvings}; expected 0 to 6")
-        if self.motion_feature_size < 1 or self.width < 1:
-            raise ValueError(
-                f"motion_feature_size, width are {self.motion_feature_size}, {self.width}; expected at least 1"
-            )
+        check(self, "halvings", "0 to 6", lambda x: 0 <= x <= 6)
+        check(self, "motion_feature_size width", "at least 1", lambda x: x >= 1)
 
     @property
     def block(self) -> int:
