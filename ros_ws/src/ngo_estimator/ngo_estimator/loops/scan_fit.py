@@ -4,34 +4,20 @@ A pose is believed where points lie on lines, no wall is seen through, and no ot
 as well. No fit is better than a wrong one.
 """
 
-from dataclasses import dataclass
-
 import numpy as np
 
 from ngo_estimator.geometry.branch_and_bound import search
-from ngo_estimator.geometry.scan_matching import icp
+from ngo_estimator.geometry.scan_matching import Registration, icp
 from ngo_estimator.loops.key_scan_views import one_a_cell, within
 from ngo_estimator.loops.scan_settings import ScanLoopConfig
 from ngo_estimator.loops.scan_submaps import Submap
 from ngo_estimator.loops.walls_seen_through import PlacedScans, seen_through
 
 
-@dataclass(frozen=True)
-class ScanFit:
-    """How scans lie in a submap: ``pose`` ``(3,)``, ``covariance`` ``(3, 3)``, and evidence as in ``EVIDENCE``."""
-
-    pose: np.ndarray
-    covariance: np.ndarray
-    response: float
-    second_peak: float
-    on_lines: float
-    through: float
-
-
 def fit(
     config: ScanLoopConfig, submap: Submap, source: PlacedScans, centre: np.ndarray, window: np.ndarray
-) -> ScanFit | None:
-    """A source searched in a submap; None where a test fails, or where it fits elsewhere as well.
+) -> tuple[Registration, tuple[float, ...]] | None:
+    """How a source lies in a submap, with the first four of ``EVIDENCE``; None where a test fails.
 
     It is searched at ``centre`` plus and minus ``window``, both ``(3,)`` (m, m, rad).
     """
@@ -50,7 +36,7 @@ def fit(
     through = seen_through(submap.scans, source, registered.pose)
     if through > config.most_seen_through:
         return None
-    return ScanFit(registered.pose, registered.covariance, match.response, second_peak, registered.share, through)
+    return registered, (match.response, second_peak, registered.share, through)
 
 
 def search_points(config: ScanLoopConfig, source: PlacedScans) -> np.ndarray:

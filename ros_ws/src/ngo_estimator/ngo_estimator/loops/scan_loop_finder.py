@@ -201,19 +201,20 @@ class ScanLoopFinder:
         found = fit(config, submap, source, expected, likely * (config.search_factor, config.search_factor, 1.0))
         if found is None:
             return None
-        off = found.pose - expected
+        registered, evidence = found
+        off = registered.pose - expected
         off[2] = wrap(off[2])
         disagreement = float(np.linalg.norm(3.0 * off / likely))
         if disagreement > config.most_disagreement:
             return None
         # From the nearest of the submap's keys: its pose in the submap is the least uncertain.
-        nearest = int(np.argmin(np.linalg.norm(submap.poses[:, :2] - found.pose[:2], axis=1)))
+        nearest = int(np.argmin(np.linalg.norm(submap.poses[:, :2] - registered.pose[:2], axis=1)))
         earlier = submap.poses[nearest]
-        covariance = turned_covariance(-earlier[2], found.covariance) + SUBMAP_VARIANCE
+        covariance = turned_covariance(-earlier[2], registered.covariance) + SUBMAP_VARIANCE
         return ScanLoops(
             np.array(((submap.first + nearest, key),)),
-            between(earlier, found.pose)[None],
+            between(earlier, registered.pose)[None],
             covariance[None],
-            np.array(((found.response, found.second_peak, found.on_lines, found.through, disagreement, 0.0),)),
+            np.array(((*evidence, disagreement, 0.0),)),
             np.zeros(1, bool),
         )

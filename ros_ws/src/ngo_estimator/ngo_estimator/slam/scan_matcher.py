@@ -217,8 +217,9 @@ class ScanMatcher:
         found = fit(self._config, submap, source, between(self._poses[place], expected), _AROUND)
         if found is None:
             return None
-        turned = turned_covariance(self._poses[place, 2], found.covariance + SUBMAP_VARIANCE)
-        return compose(self._poses[place], found.pose), turned
+        registered, _ = found
+        turned = turned_covariance(self._poses[place, 2], registered.covariance + SUBMAP_VARIANCE)
+        return compose(self._poses[place], registered.pose), turned
 
 
 def _one_a_cell(points: np.ndarray, cell_m: float) -> np.ndarray:

@@ -157,28 +157,28 @@ class LocalOdometry:
         results: list[LocalEstimate | RejectedFrame | None] = []
         left = deque(frames)
         while left:
-            found: list[_Step | RejectedFrame] = []
+            found: list[_Taken | RejectedFrame] = []
             last, begins = self._last, False
             while left and not begins:
                 try:
-                    step = self._step(last, left[0])
+                    taken = self._taken(last, left[0])
                 except RejectedFrame as error:
                     found.append(error)
                 else:
-                    if begins := step is None:
+                    if begins := taken is None:
                         break
-                    found.append(step)
-                    last = step.later
+                    found.append(taken)
+                    last = taken
                 left.popleft()
-            estimates = self._estimates([step for step in found if isinstance(step, _Step)])
-            results += [next(estimates) if isinstance(each, _Step) else each for each in found]
+            estimates = self._estimates([each for each in found if isinstance(each, _Taken)])
+            results += [next(estimates) if isinstance(each, _Taken) else each for each in found]
             if begins:
                 self._begin(left.popleft())
                 results.append(None)
         return results
 
-    def _step(self, last: "_Taken | None", frame: PairedFrame) -> "_Step | None":
-        """The step from the last frame to this one, or None where an odometry begins; raises ``RejectedFrame``."""
+    def _taken(self, last: "_Taken | None", frame: PairedFrame) -> "_Taken | None":
+        """The frame that follows the last one, or None where an odometry begins; raises ``RejectedFrame``."""
         try:
             self._network.config.image.check(frame.image)
         except ValueError as error:
@@ -201,7 +201,7 @@ class LocalOdometry:
             actions = [*before, action]
         if self.uses_twist and (twist is None or np.shape(twist) != (3,) or not np.isfinite(twist).all()):
             raise UnusableImage(f"twist is {twist}; expected three finite numbers (m/s, m/s, rad/s)")
-        return _Step(last, _Taken(stamp_ns, _tensor(frame.image), actions), action, twist, missed)
+        return _Taken(stamp_ns, _tensor(frame.image), actions, action, twist, missed)
 
     def _begin(self, frame: PairedFrame) -> None:
         """Let this frame be the origin of ``odom``."""
@@ -214,12 +214,13 @@ class LocalOdometry:
         self._origin_stamp_ns = frame.stamp_ns
         self._last = _Taken(frame.stamp_ns, image, [NO_ACTION] * self._network.config.action_history)
 
-    def _estimates(self, steps: "list[_Step]") -> Iterator[LocalEstimate]:
-        """Run the networks over steps that follow each other; the state is that behind each step handed out."""
-        if not steps:
+    def _estimates(self, steps: "list[_Taken]") -> Iterator[LocalEstimate]:
+        """Run the networks over the steps to frames that follow the last one; the state is that behind each step."""
+        if not steps or self._last is None:
             return
-        earlier, later = (torch.cat([getattr(step, end).image for step in steps]) for end in ("earlier", "later"))
-        actions = torch.tensor([step.later.actions for step in steps]) if self.uses_action else None
+        from_frames = [self._last, *steps[:-1]]
+        earlier, later = (torch.cat([frame.image for frame in frames]) for frames in (from_frames, steps))
+        actions = torch.tensor([step.actions for step in steps]) if self.uses_action else None
         twists = (
             torch.tensor(np.array([step.twist for step in steps]), dtype=torch.float32) if self.uses_twist else None
         )
@@ -243,11 +244,11 @@ class LocalOdometry:
         variance, relative = variance + (missed * self._network.relative_std.double()) ** 2, relative.double()
         for k, step in enumerate(steps):
             self._odom = se2.compose(self._odom, relative[k])
-            self._last = step.later
+            self._last = step
             origin_code, self._origin_code = self._origin_code, None
             yield LocalEstimate(
-                stamp_ns=step.later.stamp_ns,
-                from_stamp_ns=step.earlier.stamp_ns,
+                stamp_ns=step.stamp_ns,
+                from_stamp_ns=from_frames[k].stamp_ns,
                 relative_xyyaw=relative[k].numpy().copy(),
                 covariance=torch.diag(variance[k]).numpy(),
                 origin_stamp_ns=self._origin_stamp_ns,
@@ -261,7 +262,7 @@ class LocalOdometry:
             )
 
     def _remembered(
-        self, steps: "list[_Step]", relative: torch.Tensor, log_std: torch.Tensor, features: torch.Tensor
+        self, steps: "list[_Taken]", relative: torch.Tensor, log_std: torch.Tensor, features: torch.Tensor
     ) -> tuple[torch.Tensor, torch.Tensor]:
         """Steps ``(n, 3)`` and the logarithms of their deviations, corrected by those before them, up to a gap."""
         corrected = []
@@ -281,22 +282,17 @@ class LocalOdometry:
 
 @dataclass(frozen=True)
 class _Taken:
-    """A frame ``(1, height, width, channels)`` of the odometry, and the latest actions up to it."""
+    """A frame ``(1, height, width, channels)`` of the odometry, the latest actions up to it, and what led to it.
+
+    ``missed`` counts the frames missing before it.
+    """
 
     stamp_ns: int
     image: torch.Tensor
     actions: list[int]
-
-
-@dataclass(frozen=True)
-class _Step:
-    """Two frames that follow each other, and what led from one to the other."""
-
-    earlier: _Taken
-    later: _Taken
-    action: int | None
-    twist: np.ndarray | None
-    missed: int
+    action: int | None = None
+    twist: np.ndarray | None = None
+    missed: int = 0
 
 
 def _tensor(image: np.ndarray) -> torch.Tensor:
