@@ -4,25 +4,21 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from ngo_common.settings import BadParameter, FramedSettings, frame, optional_frame, setting, topics
+from ngo_common.settings import BadParameter, frame, optional_frame, setting
 from ngo_sim.driver_choice import DRIVER_NAMES
-
-_MOST = 2**31 - 1
+from ngo_sim.paced_config import MOST, PacedConfig
 
 
 @dataclass(frozen=True)
-class SimulatorConfig(FramedSettings):
+class SimulatorConfig(PacedConfig):
     """How a simulator node runs and publishes a world; the world itself has a config of its own."""
 
-    seed: int = setting(
-        0, "Seed of everything random: maze, textures, start, noise and driver.", minimum=0, maximum=_MOST
-    )
     maze_seed: int = setting(
         -1,
         "Seed of the maze and its textures alone; start, noise and driver remain those of seed. -1: seed. Not on a "
         "Doom map.",
         minimum=-1,
-        maximum=_MOST,
+        maximum=MOST,
     )
     rate: float = setting(
         10.0,
@@ -39,30 +35,6 @@ class SimulatorConfig(FramedSettings):
         "Doom map.",
         choices=("auto", *DRIVER_NAMES, "none", "cmd_vel"),
         alias="policy",
-    )
-    frames: int = setting(
-        0, "Number of frames after which the node ends with exit code 0; 0: endless.", minimum=0, maximum=_MOST
-    )
-    wait_for_subscribers: int = setting(
-        0, "Number of subscribers of the image that frame 0 waits for.", minimum=0, maximum=100
-    )
-    wait_for_flow_control: bool = setting(
-        False, "Whether frame 0 waits until each of flow_control_topics has a publisher."
-    )
-    flow_control_topics: tuple[str, ...] = topics(
-        ("odom", "ngo/pose"),
-        "Stamped topics of the nodes that process the frames. At rate 0 the simulator stays at most max_in_flight "
-        "frames ahead of the slowest one that has a publisher.",
-    )
-    max_in_flight: int = setting(
-        4, "Number of frames that the slowest flow control topic may be behind at rate 0.", minimum=1, maximum=1000
-    )
-    stall_timeout_s: float = setting(
-        10.0,
-        "Wall time without a message on the flow control topics after which the simulator takes its frames for lost "
-        "and goes on, at rate 0; 0: never.",
-        minimum=0.0,
-        maximum=3600.0,
     )
     action_timeout_s: float = setting(
         0.5,
@@ -86,11 +58,6 @@ class SimulatorConfig(FramedSettings):
     use_wall_stamps: bool = setting(False, "Whether frames have stamps of the wall clock instead of simulated time.")
     publish_clock: bool = setting(
         False, "Whether /clock is published with the stamp of every frame; not with use_wall_stamps."
-    )
-    record: str = setting(
-        "",
-        "File for a recording of everything that is published: a new .mcap file, or a new folder for the layout of "
-        "rosbag2; empty: no recording.",
     )
     ground_truth_frame: str = frame("maze", "Frame of the ground truth: origin at the maze's corner, x along columns.")
     truth_parent_frame: str = optional_frame(

@@ -14,11 +14,10 @@ from rclpy.qos import QoSProfile
 
 from ngo_common.nodes.last_catch import spin_once
 from ngo_common.nodes.name_watch import NameWatch
-from ngo_sim.building_node_config import BuildingNodeConfig
 from ngo_sim.flow_control import FlowControl, Pacer
 from ngo_sim.nodes.consumers import Consumers
 from ngo_sim.nodes.outputs import Outputs
-from ngo_sim.simulator_config import SimulatorConfig
+from ngo_sim.paced_config import PacedConfig
 
 IDLE_S = 0.05
 _LOOK_AT_GRAPH_S = 0.1
@@ -50,7 +49,7 @@ class PacedNode(Node):
 
     @property
     @abstractmethod
-    def config(self) -> SimulatorConfig | BuildingNodeConfig:
+    def config(self) -> PacedConfig:
         """How the node runs, as it is set now."""
 
     @abstractmethod
