@@ -6,7 +6,7 @@ from collections.abc import Sequence
 import numpy as np
 import pytest
 
-from ngo_estimator.frontend.intake import mounting_yaw
+from ngo_estimator.frontend.lidar.mixture_config import MixtureConfig
 from ngo_estimator.frontend.lidar.mixture_lidar import MixtureLidar
 from ngo_estimator.geometry.planar_motion import compose
 from ngo_estimator.geometry.scan_points import Mounting
@@ -34,12 +34,14 @@ def recorded(count: int, begin_ns: int = 10**12, further_left_rad: float = 0.0) 
             WheelPose(stamp_ns, pose * (1.02, 1.02, 1.0)),
             LidarScan(stamp_ns, float(ANGLES[0]), increment, single, 0.05, 30.0, 0.0, "laser"),
         ]
-        pose = compose(pose, np.array((0.06, 0.0, 0.03)))
+        pose = compose(pose, np.array((0.06, 0.0, 0.03 + 0.1 * math.sin(0.3 * k))))
     return records
 
 
-def run_over(records: Sequence[Record]) -> tuple[LidarRun, list[RecordedStep], list[RecordedRun]]:
-    run = LidarRun(MixtureLidar(), ScanTrajectory(iterations_per_step=1), MOUNTING)
+def run_over(
+    records: Sequence[Record], config: MixtureConfig | None = None
+) -> tuple[LidarRun, list[RecordedStep], list[RecordedRun]]:
+    run = LidarRun(MixtureLidar(config), ScanTrajectory(iterations_per_step=1), MOUNTING)
     events = list(run.run(records))
     steps = [event for event in events if isinstance(event, RecordedStep)]
     return run, steps, [event for event in events if isinstance(event, RecordedRun)]
@@ -96,12 +98,9 @@ def test_stamps_that_jump_back_begin_another_trajectory() -> None:
 
 
 @pytest.mark.parametrize(("yaw", "side"), [(0.05, "left"), (-0.05, "right")])
-def test_a_scanner_that_looks_elsewhere_than_its_mounting_says_is_told(
-    yaw: float, side: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(mounting_yaw, "STRETCH_M", 0.2)
-    monkeypatch.setattr(mounting_yaw, "FEWEST", 10)
-    run, _, _ = run_over(recorded(60, further_left_rad=yaw))
+def test_a_scanner_that_looks_elsewhere_than_its_mounting_says_is_told(yaw: float, side: str) -> None:
+    config = MixtureConfig(certain_m=0.5, certain_rad=0.5)  # so that a short way tells it
+    run, _, _ = run_over(recorded(120, further_left_rad=yaw), config)
     assert run.facts["mounting_yaw_deg"] == pytest.approx(math.degrees(yaw), abs=0.6)
     (remark,) = run.remarks()
     assert f"{abs(run.facts['mounting_yaw_deg']):.1f} deg further to the {side}" in remark

@@ -9,7 +9,6 @@ import numpy as np
 from ngo_estimator.data.relative_step import LARGEST_ODOMETRY, RelativeStep
 from ngo_estimator.frontend.intake.floor_rays import FloorRays
 from ngo_estimator.frontend.intake.imu_turns import ImuTurns
-from ngo_estimator.frontend.intake.mounting_yaw import MountingYaw
 from ngo_estimator.frontend.intake.scanner import Scanner
 from ngo_estimator.frontend.intake.single_wheels import SingleWheels
 from ngo_estimator.frontend.intake.stray_stamps import StrayStamps
@@ -60,7 +59,6 @@ class LidarIntake:
         self._imu.interrupt()
         self._wheels = CorrectedWheels(self._imu)
         self._waiting_wheels: deque[WheelPose] = deque()
-        self._yaw = MountingYaw()
         clock = WheelClock()
         clock.truth = self._clock.truth
         self._clock = clock
@@ -85,7 +83,7 @@ class LidarIntake:
     @property
     def mounting_yaw_rad(self) -> float:
         """How much further to the left the scanner looks than its mounting says, by the wheels; 0 until it is known."""
-        return self._yaw.yaw_rad
+        return self.front_end.mounting_yaw_rad
 
     @property
     def restarts(self) -> int:
@@ -187,10 +185,6 @@ class LidarIntake:
         late_ns = round(self.front_end.lag_s * 1e9)
         motion = self._wheels.motion(step.from_stamp_ns - late_ns, step.stamp_ns - late_ns)
         elapsed_s = (step.stamp_ns - step.from_stamp_ns) * 1e-9
-        if motion is None or step.unsure:
-            self._yaw.interrupt()
-        else:
-            self._yaw.observe(step.relative_xyyaw, motion, elapsed_s)
         counted = self._wheels.turn(step.from_stamp_ns - late_ns, step.stamp_ns - late_ns)
         if counted is not None and not step.unsure:
             early_ns = late_ns + round(self._clock.truth.age_s * 1e9)

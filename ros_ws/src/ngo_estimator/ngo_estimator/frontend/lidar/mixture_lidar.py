@@ -38,6 +38,9 @@ _WHEEL_WAIT_S = 0.25
 _SILENT_S = 1.0
 """Wheels that were silent for longer are not waited for."""
 
+_LEAST_YAW_RAD = 0.015
+"""A smaller yaw of the scanner is noise of the calibration."""
+
 _SWEPT_M, _SWEPT_RAD = 0.005, 0.005
 """Motion until the middle of a sweep that is too small to remove it anew."""
 
@@ -88,6 +91,14 @@ class MixtureLidar:
     def lag_s(self) -> float:
         """How much older the scans are than their stamps (s), by the wheels' clock; 0 until it is known."""
         return 0.0 if self._wheels is None else self._wheels.lag_s
+
+    @property
+    def mounting_yaw_rad(self) -> float:
+        """How much further to the left the scanner looks than its mounting says, by the wheels that matches calibrated;
+        0 until it is known."""
+        ahead = self._core.mixture.calibration[0]
+        yaw = -math.atan2(ahead[1], ahead[0])
+        return yaw if abs(yaw) > _LEAST_YAW_RAD else 0.0
 
     def add_wheels(self, stamp_ns: int, pose_xyyaw: Array) -> None:
         """Take the wheels' pose ``(3,)`` in their own frame.
