@@ -7,7 +7,8 @@ from typing import Any
 
 import numpy as np
 import pytest
-from rosbags.rosbag1 import Writer
+from mcap.writer import Writer as McapWriter
+from rosbags.rosbag1 import Reader, Writer
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from ngo_recordings.errors import RecordingError
@@ -152,6 +153,25 @@ def test_index_records_of_2010_that_say_a_wrong_length_do_no_harm(tmp_path: Path
     path.write_bytes(made)
     with open_recording([path]) as recording:
         assert [(each.topic, each.log_time_ns) for each in recording.messages()] == whole
+
+
+def test_a_bag_that_was_converted_to_mcap_is_read(tmp_path: Path) -> None:
+    """As `mcap convert` writes it."""
+    path, messages = tmp_path / "drive.mcap", write_bag(tmp_path / "drive.bag")
+    with Reader(messages) as bag, path.open("wb") as stream:
+        writer = McapWriter(stream)
+        writer.start(profile="ros1")
+        channels = {}
+        for each in bag.connections:
+            name = each.msgtype.replace("/msg/", "/")
+            schema = writer.register_schema(name, "ros1msg", each.msgdef.data.encode())
+            channels[each.id] = writer.register_channel(each.topic, "ros1", schema)
+        for each, time_ns, data in bag.messages():
+            writer.add_message(channels[each.id], time_ns, data, time_ns)
+        writer.finish()
+    with open_recording([path]) as found, open_recording([messages]) as right:
+        assert found.topics == right.topics and found.notes == ()
+        assert [repr(each) for each in found.messages()] == [repr(each) for each in right.messages()]
 
 
 def test_format_1_2_is_read(tmp_path: Path) -> None:

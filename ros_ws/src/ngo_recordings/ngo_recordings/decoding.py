@@ -12,10 +12,9 @@ from rosbags.typesys import Stores, TypesysError, get_types_from_idl, get_types_
 
 from ngo_recordings.carmen_log import ENCODING as OBJECTS
 from ngo_recordings.definition_cost import DefinitionCost
-from ngo_recordings.definitions import message_definition
+from ngo_recordings.definitions import ROS1_ENCODING, message_definition
 from ngo_recordings.errors import RecordingError
 from ngo_recordings.mcap_file import Stored
-from ngo_recordings.ros1_bag import ENCODING as ROS1
 
 _SEPARATOR = "=" * 80 + "\n"
 _MAX_REASON = 300
@@ -58,7 +57,7 @@ class Decoder:
         typestore, cost = self._typestores[type_name]
         try:
             cost.check(len(data))
-            read = typestore.deserialize_ros1 if encoding == ROS1 else typestore.deserialize_cdr
+            read = typestore.deserialize_ros1 if encoding == ROS1_ENCODING else typestore.deserialize_cdr
             return read(data, type_name)
         except _BROKEN as error:
             raise RecordingError(
@@ -69,7 +68,7 @@ class Decoder:
     def _typestore(self, stored: Stored) -> tuple[Any, DefinitionCost]:
         """A store of its own for every type: another type may hold another version of what it is made of."""
         try:
-            if stored.encoding in ("ros2msg", ROS1):
+            if stored.encoding in ("ros2msg", ROS1_ENCODING):
                 types = get_types_from_msg(stored.definition, stored.type_name)
             elif stored.encoding in ("ros2idl", "omgidl"):
                 types = {}

@@ -1,4 +1,4 @@
-"""Texts of message types, from the ROS packages that are installed on this machine."""
+"""Names and texts of message types: those of the ROS packages on this machine, and what ROS 1 called them."""
 
 from __future__ import annotations
 
@@ -10,6 +10,21 @@ from functools import cache
 from pathlib import Path
 
 from ngo_recordings.errors import RecordingError
+
+ROS1_ENCODING = "ros1msg"
+_RENAMED = {"tf/msg/tfMessage": "tf2_msgs/msg/TFMessage", "roslib/msg/Header": "std_msgs/msg/Header"}
+
+
+def plain_definition(text: str) -> str:
+    """A definition of ROS 1 with the names that the types have since."""
+    return text.replace("roslib/Header", "std_msgs/Header")
+
+
+def ros2_type(name: str) -> str:
+    """What ROS 2 calls a type of ROS 1."""
+    package, _, short = name.partition("/")
+    made = f"{package}/msg/{short.removeprefix('msg/')}"
+    return _RENAMED.get(made, made)
 
 
 @cache

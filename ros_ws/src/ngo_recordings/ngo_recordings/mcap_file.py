@@ -21,6 +21,7 @@ from mcap.stream_reader import read_magic
 from mcap.summary import Summary
 
 from ngo_recordings.bounds import MAX_CHUNK_BYTES, check_regular, unpacked
+from ngo_recordings.definitions import ROS1_ENCODING, plain_definition, ros2_type
 from ngo_recordings.errors import RecordingError
 
 # What the library lets through when the bytes are not what they should be.
@@ -85,6 +86,7 @@ class McapFile:
         self.unfinished = False
         self._chunked = True
         self.topics: dict[str, Stored] = {}
+        self._damaged = ""
         self._foreign: dict[int, str] = {}  # by channel, why its messages cannot be read
         try:
             read_magic(ReadDataStream(self._stream))
@@ -221,7 +223,12 @@ class McapFile:
         for position, opcode, length in self._whole_records(self._stream):
             if opcode == Opcode.CHUNK:
                 self._chunked = True
-                summary.chunk_indexes.append(self._scan_chunk(summary, position, length))
+                try:
+                    summary.chunk_indexes.append(self._scan_chunk(summary, position, length))
+                except RecordingError as error:
+                    if not summary.chunk_indexes:
+                        raise
+                    self._damaged = self._damaged or f"{error}: this chunk is left out"
             elif opcode in (Opcode.SCHEMA, Opcode.CHANNEL, Opcode.MESSAGE):
                 self._collect(summary, opcode, self._record(self._stream, position, length))
         return summary
@@ -275,7 +282,8 @@ class McapFile:
             stream.seek(position)
             opcode, length = _RECORD_HEAD.unpack(stream.read(_RECORD_HEAD_SIZE))
             length += _RECORD_HEAD_SIZE
-            if opcode in (Opcode.FOOTER, Opcode.DATA_END) or position + length > self._size:
+            # A disk that lost its power leaves zeros.
+            if opcode in (0, Opcode.FOOTER, Opcode.DATA_END) or position + length > self._size:
                 return
             yield position, opcode, length
             position += length
@@ -296,6 +304,7 @@ class McapFile:
             raise RecordingError(f"{self.path}: {next(iter(self._foreign.values()))}")
         # A topic that nobody uses is no reason to refuse the others.
         self.notes = tuple(f"{self.path.name}: {reason}: left out" for reason in dict.fromkeys(self._foreign.values()))
+        self.notes += (self._damaged,) if self._damaged else ()
         if self.unfinished and not self.topics:
             self.notes = (f"{self.path.name} is cut off before its first chunk ends: nothing of it can be read",)
 
@@ -326,14 +335,18 @@ class McapFile:
         """The topic of a channel; None where its messages are in an encoding that ROS 2 does not record."""
         channel = summary.channels[channel_id]
         schema = summary.schemas.get(channel.schema_id)
-        if channel.message_encoding != "cdr" or schema is None:
+        of_ros1 = schema is not None and (channel.message_encoding, schema.encoding) == ("ros1", ROS1_ENCODING)
+        if schema is None or (channel.message_encoding != "cdr" and not of_ros1):
             self._foreign[channel_id] = (
                 f"messages of {channel.topic} are in {channel.message_encoding or 'no'} encoding"
                 f"{'' if schema else ' without a definition'}; expected CDR with one, as ROS 2 records"
             )
             return None
         if channel.topic not in self.topics:
-            self.topics[channel.topic] = Stored(schema.name, schema.data.decode(), schema.encoding)
+            name, text = schema.name, schema.data.decode()
+            self.topics[channel.topic] = Stored(
+                ros2_type(name) if of_ros1 else name, plain_definition(text) if of_ros1 else text, schema.encoding
+            )
         return self.topics[channel.topic]
 
 

@@ -11,15 +11,11 @@ from rosbags.rosbag1 import Reader, ReaderError
 from rosbags.rosbag1.reader import decompressors
 
 from ngo_recordings.bounds import MAX_CHUNK_BYTES, check_regular, unpacked
+from ngo_recordings.definitions import ROS1_ENCODING, plain_definition, ros2_type
 from ngo_recordings.errors import RecordingError
 from ngo_recordings.mcap_file import BROKEN, Stored
-from ngo_recordings.ros1_records import ENCODING, plain_definition
-
-__all__ = ["ENCODING", "Ros1Bag"]
 
 _BROKEN = (ReaderError, AssertionError, AttributeError, TypeError, *BROKEN)
-# What ROS 1 called it before tf2.
-_RENAMED = {"tf/msg/tfMessage": "tf2_msgs/msg/TFMessage"}
 
 
 class Ros1Bag:
@@ -86,9 +82,9 @@ class Ros1Bag:
             self._reader.chunks[position] = chunk._replace(decompressor=unpack)
 
     def _add(self, connection: Connection) -> None:
-        type_name = _RENAMED.get(connection.msgtype, connection.msgtype)
+        type_name = ros2_type(connection.msgtype)
         definition = plain_definition(connection.msgdef.data)
-        stored = self.topics.setdefault(connection.topic, Stored(type_name, definition, ENCODING))
+        stored = self.topics.setdefault(connection.topic, Stored(type_name, definition, ROS1_ENCODING))
         if stored.type_name != type_name:
             raise RecordingError(f"topic {connection.topic} is {stored.type_name} and {type_name}: expected one type")
         times = self._reader.indexes[connection.id]

@@ -14,16 +14,14 @@ from pathlib import Path
 from typing import BinaryIO
 
 from ngo_recordings.bounds import unpacked
+from ngo_recordings.definitions import ROS1_ENCODING, plain_definition, ros2_type
 from ngo_recordings.errors import RecordingError
 from ngo_recordings.mcap_file import Stored
 
-ENCODING = "ros1msg"
 _MAGIC = {b"#ROSBAG V2.0\n": 2, b"#ROSRECORD V1.2\n": 1}
 _DEFINITION, _MESSAGE, _CHUNK, _CONNECTION = 0x01, 0x02, 0x05, 0x07
 _INDEX, _INDEX_ENTRY = 0x04, 12  # records of 2010 say 20 bytes an entry
 _LARGEST_HEADER = 2**24
-# What ROS 1 called these before ROS 2 did.
-_RENAMED = {"tf/msg/tfMessage": "tf2_msgs/msg/TFMessage", "roslib/msg/Header": "std_msgs/msg/Header"}
 
 
 @dataclass(frozen=True)
@@ -120,9 +118,9 @@ class Ros1Records:
     def _define(self, fields: dict[str, bytes], data: bytes) -> None:
         described = _fields(data) if data else fields  # format 1.2 has all in the header
         topic = "/" + fields["topic"].decode().strip("/")
-        type_name = _ros2_type(described["type"].decode())
+        type_name = ros2_type(described["type"].decode())
         definition = described.get("message_definition", described.get("def", b"")).decode(errors="replace")
-        self.topics.setdefault(topic, Stored(type_name, plain_definition(definition), ENCODING))
+        self.topics.setdefault(topic, Stored(type_name, plain_definition(definition), ROS1_ENCODING))
         if "conn" in fields:
             self._connections[struct.unpack("<I", fields["conn"])[0]] = topic
 
@@ -136,17 +134,6 @@ class Ros1Records:
         log_time_ns = seconds * 1_000_000_000 + nanoseconds
         self.topics[topic].add(log_time_ns)
         self._index.append(_Found(log_time_ns, len(self._index), topic, (chunk, at), size))
-
-
-def plain_definition(text: str) -> str:
-    """A definition of ROS 1 with the names that the types have since."""
-    return text.replace("roslib/Header", "std_msgs/Header")
-
-
-def _ros2_type(name: str) -> str:
-    package, _, short = name.partition("/")
-    made = f"{package}/msg/{short.removeprefix('msg/')}"
-    return _RENAMED.get(made, made)
 
 
 def _head(stream: BinaryIO) -> tuple[dict[str, bytes], int, int]:
