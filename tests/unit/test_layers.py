@@ -38,6 +38,7 @@ LAYERS = {
             "definitions",
             "images",
             "poses",
+            "stamps",
         },
         {"recording", "writer"},
         {"topics", "laser_scan"},

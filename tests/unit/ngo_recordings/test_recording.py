@@ -159,6 +159,16 @@ def test_wherever_a_file_is_cut_it_is_read_to_its_last_whole_chunk(tmp_path: Pat
             assert read == expected([entry for entry in entries if entry[1] <= last_ns])
 
 
+def test_of_a_file_that_lost_its_end_to_zeros_the_beginning_is_read(tmp_path: Path) -> None:
+    path = m.write_mcap(tmp_path / "drive.mcap", drive(), chunk_bytes=5000)
+    whole = path.read_bytes()
+    path.write_bytes(whole[: len(whole) // 2] + bytes(len(whole) // 2))
+    with open_recording([path]) as recording:
+        read = facts(recording.messages())
+        assert 60 < len(read) < 3 * COUNT and read == expected(list(drive()))[: len(read)]
+        assert recording.unfinished and "this chunk is left out" in recording.notes[0]
+
+
 def test_what_is_written_is_on_the_file_before_it_is_closed(tmp_path: Path) -> None:
     path = tmp_path / "drive.mcap"
     with RecordingWriter(path, flush_s=0.0) as writer:
@@ -263,6 +273,26 @@ def test_of_a_folder_that_was_copied_in_part_the_rest_is_read(tmp_path: Path) ->
     metadata.write_text(metadata.read_text().replace("- drive_0.mcap", "- drive_0.mcap\n  - drive_1.mcap"))
     with open_recording([folder]) as recording:
         assert "/image" in recording.topics and "lacks drive_1.mcap" in recording.notes[0]
+
+
+@pytest.mark.parametrize("storage", list(StoragePlugin))
+def test_files_after_those_of_the_metadata_are_read(tmp_path: Path, storage: StoragePlugin) -> None:
+    entries = list(drive())
+    folder, rest = (
+        m.write_rosbag(tmp_path / name, part, storage)
+        for name, part in (("drive", entries[:90]), ("rest", entries[90:]))
+    )
+    (first,), (last,) = ([file for file in each.iterdir() if file.suffix != ".yaml"] for each in (folder, rest))
+    named = folder / f"drive_0{first.suffix}"
+    first.rename(named)
+    metadata = folder / "metadata.yaml"
+    metadata.write_text(metadata.read_text().replace(first.name, named.name))
+    for name in ("drive_1", "other"):
+        shutil.copy(last, folder / f"{name}{last.suffix}")
+    with open_recording([folder]) as recording:
+        assert facts(recording.messages()) == expected(entries)
+        (note,) = recording.notes
+        assert f"does not name drive_1{last.suffix}, which follow" in note
 
 
 def test_in_a_folder_names_say_which_files_are_recordings(tmp_path: Path) -> None:

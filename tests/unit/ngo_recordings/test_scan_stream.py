@@ -140,12 +140,30 @@ def test_what_is_damaged_is_counted_or_named(tmp_path: Path) -> None:
             list(scan_stream(recording, RecordingTopics("/odom")))
 
 
-def test_scans_without_stamps_are_refused(tmp_path: Path) -> None:
-    with (
-        open_recording([m.write_mcap(tmp_path / "a.mcap", [("/scan", k, scan(0)) for k in range(3)])]) as recording,
-        pytest.raises(RecordingError, match="have no stamps"),
-    ):
-        list(scan_stream(recording, RecordingTopics("/scan")))
+@pytest.mark.parametrize(
+    ("unit", "said"),
+    [
+        (0.0, "stand still"),
+        (1e-3, "run 0.001 times as fast as the clock"),
+        (1e3, "run 1e+03 times as fast as the clock"),
+        (-1e7, "run -1e+07 times as fast as the clock"),  # overflowed
+    ],
+)
+def test_where_stamps_run_as_no_clock_does_the_times_of_the_recording_count(
+    tmp_path: Path, unit: float, said: str
+) -> None:
+    for wrong in ("/scan", "/odom"):
+        entries = drive(30)
+        for topic, time_ns, message in entries:
+            if topic == wrong:
+                stamp_ns = round(unit * time_ns)
+                message.header.stamp.sec, message.header.stamp.nanosec = stamp_ns // 10**9, stamp_ns % 10**9
+        with open_recording([m.write_mcap(tmp_path / f"{wrong[1:]}.mcap", entries)]) as recording:
+            topics = choose_topics(recording)
+            assert recording.notes == (f"stamps of {wrong} {said}: the times of the recording count",)
+            records = list(scan_stream(recording, topics))
+            assert [r.stamp_ns for r in records if isinstance(r, LidarScan)] == [stamp(k + 0.5) for k in range(30)]
+            assert [r.stamp_ns for r in records if isinstance(r, WheelPose)] == [stamp(k) for k in range(30)]
 
 
 def geometry(low: float, high: float, increment: float, rays: int) -> Any:
@@ -303,6 +321,14 @@ def test_transforms_that_are_sent_again_and_again_serve_but_not_those_that_move_
     np.testing.assert_allclose(found.base_from_scan_xyyaw, [0.1, 0.0, 0.2], atol=1e-12)
     outside = m.transform(stamp(0), "odom", "laser", m.pose(0.1, 0.0, 0.2))
     assert mounted(tmp_path / "b.mcap", ("/tf", stamp(0), m.transforms(moving, outside))) is None
+
+
+def test_a_chain_may_be_said_in_part_by_static_transforms(tmp_path: Path) -> None:
+    lift = m.transform(stamp(0), "base_link", "lift", m.pose(0.1, 0.0, 0.0))
+    laser = static("lift", "laser", 0.2, 0.0, 0.5)
+    said = ("/tf", stamp(0), m.transforms(lift)), ("/tf_static", stamp(1), m.transforms(laser))
+    found = mounted(tmp_path / "a.mcap", *said)
+    np.testing.assert_allclose(found.base_from_scan_xyyaw, [0.3, 0.0, 0.5], atol=1e-12)
 
 
 def test_without_transforms_the_mounting_is_not_known_unless_frames_are_the_same(tmp_path: Path) -> None:

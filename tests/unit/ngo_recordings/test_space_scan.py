@@ -53,7 +53,17 @@ def off_walls(scan: LidarScan) -> np.ndarray:
 
 
 @pytest.mark.parametrize(
-    "layout", [{}, {"height": 1800}, {"padding": 10}, {"big": True}, {"kind": "f8"}, {"shuffled": True}, {"rings": 32}]
+    "layout",
+    [
+        {},
+        {"height": 1800},
+        {"height": 16, "row_step": 0},
+        {"padding": 10},
+        {"big": True},
+        {"kind": "f8"},
+        {"shuffled": True},
+        {"rings": 32},
+    ],
 )
 def test_any_layout_of_rings_is_the_scan_at_the_sensors_height(layout: dict[str, Any]) -> None:
     """Neither floor nor ceiling is in it, and most angles saw a wall."""
@@ -61,7 +71,10 @@ def test_any_layout_of_rings_is_the_scan_at_the_sensors_height(layout: dict[str,
     if layout.pop("shuffled", False):
         points = np.random.default_rng(0).permutation(points)
         points[::7] = np.nan
-    made = cloud_scan(m.cloud(BEGIN_NS, fields(points, layout.pop("kind", "f4")), **layout), "/points")
+    row_step = layout.pop("row_step", None)
+    message = m.cloud(BEGIN_NS, fields(points, layout.pop("kind", "f4")), **layout)
+    message.row_step = row_step if row_step is not None else message.row_step
+    made = cloud_scan(message, "/points")
     assert (made.stamp_ns, made.frame_id, made.offsets_s) == (BEGIN_NS, "lidar", None)
     assert np.isfinite(made.ranges).sum() > 1300 and off_walls(made).max() < 0.02
 
@@ -135,6 +148,7 @@ def test_a_recording_of_clouds_is_a_stream_of_scans(tmp_path: Path) -> None:
         stamp_ns = BEGIN_NS + k * 10**8
         entries.append(("/odom", stamp_ns, odometry(stamp_ns, 0.0, 0.0, 0.0)))
         entries.append(("/points", stamp_ns, m.cloud(stamp_ns, fields(turned), "camera_optical_frame")))
+        entries.append(("/points/filtered", stamp_ns, m.cloud(stamp_ns, fields(turned[::9]), "camera_optical_frame")))
     with open_recording([m.write_mcap(tmp_path / "a.mcap", entries)]) as recording:
         topics = choose_topics(recording)
         assert (topics.image, str(topics.wheels)) == ("/points", "/odom")
@@ -143,6 +157,7 @@ def test_a_recording_of_clouds_is_a_stream_of_scans(tmp_path: Path) -> None:
     scans = [each for each in found if isinstance(each, LidarScan)]
     assert len(scans) == 3 and sum(isinstance(each, WheelPose) for each in found) == 3
     assert off_walls(scans[0]).max() < 0.02
+    assert any("others are /points/filtered (10.0 Hz)" in note for note in described.notes)
     assert described.mounting is not None and not described.mounting.upside_down
     np.testing.assert_allclose(described.mounting.base_from_scan_xyyaw, (0.1, 0.0, math.pi / 2), atol=1e-9)
     assert described.mounting.tilt_rad < 1e-6

@@ -119,16 +119,14 @@ def find_pose(
             source += ", as it was said for the longest time: it changes on the way"
         return found[0], scan_frame, found[1], source
     moving = [name for name in names if name not in static]
-    known = set(tree.frames())
     start_ns: int | None = None
     for log_time_ns, each in _transforms(recording, moving):
         start_ns = log_time_ns if start_ns is None else start_ns
         if log_time_ns > start_ns + _LOOK_NS:
             break
         parent, child = each.header.frame_id.strip("/"), each.child_frame_id.strip("/")
-        if child in known or any(is_named(parent, name, scan_frame) for name in _OUTSIDE):
+        if tree.parent(child) is not None or any(is_named(parent, name, scan_frame) for name in _OUTSIDE):
             continue
-        known.add(child)
         tree.take((each,), static=True)
         if (found := _lookup(tree, bases, scan_frame)) is not None:
             return found[0], scan_frame, found[1], ", ".join(moving)

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import heapq
+import math
+import re
 from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from contextlib import ExitStack, suppress
 from dataclasses import dataclass
@@ -30,12 +32,14 @@ from ngo_recordings.mcap_file import McapFile
 from ngo_recordings.ros1_bag import Ros1Bag
 from ngo_recordings.ros1_records import Ros1Records
 from ngo_recordings.rosbag_folder import RosbagFolder
+from ngo_recordings.stamps import stamp_as_recorded, stamp_fault
 
 Source = McapFile | RosbagFolder | Ros1Bag | Ros1Records | CarmenLog | CopiedFile
 _PACKED_MESSAGE = b"\x28\xb5\x2f\xfd"  # begins no message in CDR
 
 _CARMEN = (".log", ".clf", ".log.gz", ".clf.gz")
 _IN_FOLDERS = (".mcap", ".db3", PACKED)
+_NUMBERED = re.compile(r"(.*_)(\d+)(\..*)")
 _EMPTY = "has nothing in it: left out"
 _OTHERS = "is not read: in a folder .mcap files count before .db3 files, and these before packed ones"
 _KINDS = "a .mcap, .db3 or .bag file, a CARMEN log (.log, .clf, either with .gz), or the folder of a rosbag2"
@@ -74,6 +78,7 @@ class Recording:
         self.unfinished = tuple(source.path for source in sources if source.unfinished)
         self.stamps_made = tuple(source.path for source in sources if source.stamps_made)
         self.notes = (*notes, *(note for source in sources for note in source.notes))
+        self._as_recorded: set[str] = set()
         self.topics: dict[str, TopicInfo] = {}
         for name in sorted({name for source in sources for name in source.topics}):
             stored = [source.topics[name] for source in sources if name in source.topics]
@@ -102,6 +107,13 @@ class Recording:
         for source, _ in self._sources:
             source.close()
 
+    def check_stamps(self, names: Iterable[str]) -> None:
+        """Stamps of these topics that run as no clock does are from now on the times at which they were recorded."""
+        for name in set(names) - self._as_recorded:
+            if fault := stamp_fault(self.messages([name])):
+                self._as_recorded.add(name)
+                self.notes = (*self.notes, f"stamps of {name} {fault}: the times of the recording count")
+
     def spans_ns(self, name: str) -> list[tuple[int, int]]:
         """Log times of a topic's first and last message in each file that has any."""
         stored = [source.topics[name] for source, _ in self._sources if name in source.topics]
@@ -122,9 +134,14 @@ class Recording:
             )
         # Of equal times, the file that was named first comes first: the order does not depend on chance.
         streams = [_decoded(source, decoder, wanted) for source, decoder in self._sources]
-        if len(streams) == 1:
-            return streams[0]
-        return heapq.merge(*streams, key=lambda message: message.log_time_ns)
+        merged = streams[0] if len(streams) == 1 else heapq.merge(*streams, key=lambda message: message.log_time_ns)
+        return self._stamped(merged) if wanted & self._as_recorded else merged
+
+    def _stamped(self, messages: Iterator[Message]) -> Iterator[Message]:
+        for message in messages:
+            if message.topic in self._as_recorded:
+                stamp_as_recorded(message)
+            yield message
 
     def first(self, name: str) -> Message:
         """The first message of a topic. Raises RecordingError where there is none, whatever the file's index says."""
@@ -216,11 +233,17 @@ def _open_folder(path: Path, max_chunk_bytes: int, notes: list[str]) -> Iterator
         notes.append(f"{metadata} is not what rosbag2 writes: the files beside it are read as they are")
         yield from _open_files(path, path.iterdir(), max_chunk_bytes, notes)
         return
+    if later := _later(path, names):
+        notes.append(f"metadata.yaml of {path} does not name {', '.join(later)}, which follow: they are read, too")
+        names += later
     if missing := [name for name in names if not (path / name).exists()]:
         notes.append(f"{path} lacks {', '.join(missing)}, which its metadata.yaml names: what is there is read")
         named = [path / name for name in names if name not in missing]
         useful = any(file.stat().st_size for file in named)
         yield from _open_files(path, named if useful else path.iterdir(), max_chunk_bytes, notes)
+        return
+    if later:
+        yield from _open_files(path, [path / name for name in names], max_chunk_bytes, notes)
         return
     if not plain_mcap:
         for name in names:
@@ -239,6 +262,14 @@ def _open_folder(path: Path, max_chunk_bytes: int, notes: list[str]) -> Iterator
         return
     for name in names:
         yield McapFile(path / name, max_chunk_bytes)
+
+
+def _later(path: Path, names: list[str]) -> list[str]:
+    """The files of a folder that follow those that its metadata.yaml names: their recorder was killed."""
+    newest = {match.group(1, 3): int(match[2]) for name in names if (match := _NUMBERED.fullmatch(name))}
+    found = [match for file in path.iterdir() if (match := _NUMBERED.fullmatch(file.name))]
+    later = [match for match in found if int(match[2]) > newest.get(match.group(1, 3), math.inf)]
+    return [match[0] for match in sorted(later, key=lambda match: int(match[2]))]
 
 
 def _open_files(path: Path, files: Iterable[Path], max_chunk_bytes: int, notes: list[str]) -> Iterator[Source]:

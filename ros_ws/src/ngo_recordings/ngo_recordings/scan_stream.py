@@ -73,7 +73,7 @@ def scan_stream(
             an error, and poses that are no numbers are left out.
 
     Raises:
-        RecordingError: topics.image holds no scans, scans have no stamps, or one is damaged.
+        RecordingError: topics.image holds no scans, or one is damaged.
     """
     readers = {topic: scan_reader(recording, topic, angle_increment) for topic in topics.scans}
     if angle_increment is not None and not is_increment(angle_increment, 1):
@@ -109,8 +109,6 @@ def scan_stream(
             continue
         for record in found:
             before = newest.get(message.topic)
-            if is_scan and record.stamp_ns == 0 and before == 0:
-                raise RecordingError(f"scans of {topics.image} have no stamps (all are 0): the driver must stamp them")
             if before is not None and record.stamp_ns <= before - RESTART_NS:
                 while waiting:
                     yield heapq.heappop(waiting)[-1]

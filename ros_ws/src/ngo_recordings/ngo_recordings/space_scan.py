@@ -137,9 +137,9 @@ def _records(message: Any, topic: str) -> np.ndarray:
     formats = [order + _FORMATS[field.datatype] for field in known]
     ends = [field.offset + np.dtype(each).itemsize for field, each in zip(known, formats, strict=True)]
     data = np.frombuffer(message.data, np.uint8)
-    if height == 1:
+    if height == 1 or row < step * width:  # drivers leave it at 0
         row = step * width
-    if max(ends, default=0) > step or row < step * width or len(data) < row * (height - 1) + step * width:
+    if max(ends, default=0) > step or len(data) < row * (height - 1) + step * width:
         raise RecordingError(
             f"a cloud of {topic} has {len(data)} bytes; expected {height} rows of {row} bytes, {width} points of {step}"
         )

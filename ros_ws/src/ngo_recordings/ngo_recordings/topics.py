@@ -186,6 +186,9 @@ def choose_topics(
     if given.imu is None and wheels is not None:
         names = _filled(recording, (IMU_TYPE,))
         imu = min((name for name in names if _related(name, image)), default=_only(names))
+    more_scans = tuple(name for name in more if name is not None)
+    sensors = (image, *more_scans, imu, None if wheels is None else wheels.topic)
+    recording.check_stamps(name for name in sensors if name is not None)
     return RecordingTopics(
         image=image,
         depth=_given(recording, "depth", given.depth, (IMAGE_TYPE,)),
@@ -197,20 +200,17 @@ def choose_topics(
         twist_tolerance_s=given.twist_tolerance_s,
         wheels=wheels,
         imu=imu,
-        more_scans=tuple(name for name in more if name is not None),
+        more_scans=more_scans,
     )
 
 
 def choose_scan(recording: Recording) -> str | None:
-    """The topic of laser scans, of several the one called scan in the shortest namespace; None: there is none.
+    """The topic of laser scans, else that of point clouds; of several the one called scan in the shortest namespace.
 
-    Where there are no laser scans, that of point clouds, if it is the only one.
+    None: there is none.
     """
-    names = _filled(recording, (SCAN_TYPE,))
-    if not names:
-        return _only(_filled(recording, (CLOUD_TYPE,)))
     return min(
-        names,
+        _filled(recording, (SCAN_TYPE,)) or _filled(recording, (CLOUD_TYPE,)),
         key=lambda name: (not name.endswith("/scan"), name.count("/"), -recording.topics[name].count, name),
         default=None,
     )

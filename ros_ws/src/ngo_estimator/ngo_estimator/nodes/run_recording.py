@@ -109,7 +109,7 @@ class Arguments:
 
     def uses_camera(self, recording: Recording) -> bool:
         """Whether pictures are tracked without weights: as world says, or for pictures with a CameraInfo, no scans."""
-        if self.world is not None or self.weights is not None:
+        if self.world is not None or self.weights is not None or self.topics.scan_topics:
             return self.world == CAMERA_WORLD
         filled = {info.type_name for info in recording.topics.values() if info.count}
         pictures, scans = filled & {IMAGE_TYPE, COMPRESSED_TYPE}, filled & {SCAN_TYPE, CLOUD_TYPE}
@@ -120,7 +120,7 @@ class Arguments:
         shipped = Path(get_package_share_directory("ngo_estimator"), "weights")
         world = self.world
         if world is None and self.weights is None:
-            if not any(info.type_name in (SCAN_TYPE, CLOUD_TYPE) and info.count for info in recording.topics.values()):
+            if not self.topics.scan_topics and choose_scan(recording) is None:
                 raise ValueError(
                     "expected --world (but scan) or --weights FOLDER: there are no laser scans, and no CameraInfo with "
                     "pictures, which need neither"
@@ -272,7 +272,7 @@ def _networks(arguments: Arguments, folder: Path, recording: Recording, console:
     online = OnlineTrajectory.load(folder, arguments.window_frames, arguments.world, *bounds)
     topics = choose_topics(recording, _for_weights(recording, arguments.topics, local))
     _check_side_information(topics, local)
-    console.print(f"using {_words(topics)}", soft_wrap=True, highlight=False)
+    console.print("; ".join((f"using {_words(topics)}", *recording.notes)), soft_wrap=True, highlight=False)
     with compiling(partial(console.print, highlight=False)):
         warm_up_networks(online)
     core = RecordingRun(local, online, scan_yaw_rad=math.radians(arguments.scan_yaw_deg))
@@ -363,7 +363,8 @@ def _camera(arguments: Arguments, recording: Recording, console: Console) -> "St
         where = f"{frame} in {base} at {', '.join(f'{value:.3f}' for value in pose.position)} m (from {source})"
     model = calibrated_camera(seen, pose)
     odometry = PictureOdometry(model)
-    console.print(f"using {_words(topics)}, calibration {info}", soft_wrap=True, highlight=False)
+    used = f"using {_words(topics)}, calibration {info}"
+    console.print("; ".join((used, *recording.notes)), soft_wrap=True, highlight=False)
     console.print(
         f"camera: {seen.width} x {seen.height}, {model.description}; {where}", soft_wrap=True, highlight=False
     )
