@@ -82,13 +82,13 @@ def test_ranges_in_millimetres_are_told_and_scaled(limit_m: float, unit: float, 
     assert scanner.remarks("laser") == ["laser: its ranges are in millimetres: taken so"]
 
 
-@pytest.mark.parametrize("limits_m", [(100.0, 120.0), (50.0, 12_000.0), (15.0, 0.0)])
+@pytest.mark.parametrize("limits_m", [(100.0, 120.0), (50.0, 12_000.0), (15.0, 0.0), (0.1, 0.5)])
 def test_limits_that_contradict_all_ranges_are_told_and_not_used(limits_m: tuple[float, float]) -> None:
     scanner = Scanner()
     for scan in drive(10):
         found = scanner.correct(replace(scan, range_min=limits_m[0], range_max=limits_m[1]), 0.0)
     assert found is not None and len(found.hits()) == len(scan.hits())
-    assert scanner.remarks("laser") == ["laser: its smallest range is above what it measures: its limits are not used"]
+    assert scanner.remarks("laser") == ["laser: most of what it measures is beyond its limits: they are not used"]
 
 
 def test_a_driver_that_begins_with_ranges_far_away_is_in_metres_again() -> None:
@@ -124,6 +124,20 @@ def test_a_scan_that_is_published_again_is_left_out(late_ns: int) -> None:
     ]
     assert [scan.stamp_ns for scan in kept[-19:]] == [scan.stamp_ns for scan in scans[1:]]
     assert "scans are the one before once more" in scanner.remarks("laser")[0]
+
+
+@pytest.mark.parametrize(("way", "sees", "counted"), [(0.08, True, 4), (0.0, True, 40), (0.08, False, 40)])
+def test_a_scanner_that_froze_repeats_its_scan_while_the_wheels_drive(way: float, sees: bool, counted: int) -> None:
+    """A robot that stands, or sees nothing, sees the same."""
+    scanner, (scan, other) = Scanner(), drive(2)
+    scan = scan if sees else replace(scan, ranges=np.full(RAYS, np.inf, np.float32))
+    kept = 0
+    for k in range(40):
+        driven = lambda from_ns, now=k: np.array((way * (now - from_ns / 10**8), 0.0, 0.0))  # noqa: E731
+        kept += scanner.correct(replace(scan, stamp_ns=k * 10**8), 0.0, driven) is not None
+    assert kept == counted
+    assert any("while the wheels drive" in line for line in scanner.remarks("laser")) == (counted < 40)
+    assert scanner.correct(replace(other, stamp_ns=40 * 10**8), 0.0, driven) is not None
 
 
 def test_a_simulated_robot_that_stands_sees_the_same_at_its_usual_pace() -> None:

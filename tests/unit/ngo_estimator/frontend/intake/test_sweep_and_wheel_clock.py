@@ -81,6 +81,7 @@ SWEPT = records(drive(90), sweeps=True)
         (1.0, True, "in the other order than the driver says"),
         (-1.0, False, "in the other order than the driver says"),
         (1e9, False, "times from ray to ray are taken times 1e-09"),
+        (RAYS, False, "times from ray to ray are taken times 0.00555556"),  # the time of the whole sweep
         (1e3, True, "in the other order than the driver says"),
         (77.0, False, "its sweep lasts 0.100 s in the order of its rays"),
     ],

@@ -140,7 +140,8 @@ class ImuTurns:
             return ""
         if self._count < 1.0:
             return (
-                "the IMU is not used: nothing could be compared with it, for want of wheels or of stamps of one clock"
+                "the IMU is not used: nothing could be compared with it, for want of wheels, of stamps of one clock or "
+                "of five readings a second"
             )
         deviations = [math.degrees(math.sqrt(off / self._count)) for off in (self._off.min(), self._wheels_off)]
         late = ", its rates being in degrees/s" if self.unit != 1.0 else ""

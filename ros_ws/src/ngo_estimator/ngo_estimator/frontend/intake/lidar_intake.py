@@ -132,7 +132,7 @@ class LidarIntake:
         mounting = self._mountings[scanner]
         if mounting is None:
             return
-        corrected = self._scanners[scanner].correct(scan, self._min_range_m)
+        corrected = self._scanners[scanner].correct(scan, self._min_range_m, self._wheels.since)
         if corrected is not None:
             corrected = self._floor.without(corrected, mounting)
             self._hand_on(self._turns.add(Part(corrected, mounting, scanner)))

@@ -1,4 +1,4 @@
-"""Ranges or limits that a driver gives in another unit: no scanner sees so far, or measures less than its least."""
+"""Ranges or limits that a driver gives in another unit: no scanner sees so far, or mostly beyond its limits."""
 
 from dataclasses import replace
 
@@ -29,20 +29,20 @@ class RangeUnit:
     def __init__(self) -> None:
         self.millimetres = False
         """Whether ranges are in millimetres."""
-        self._doubted = self._below = 0
+        self._doubted = self._beyond = 0
 
     def metres(self, scan: LidarScan) -> LidarScan:
         """The scan in metres, also its limits where these are not."""
-        near, far = _nearly_all(scan.ranges)
+        near, middle, far = _quantiles(scan.ranges)
         doubted = 0.0 < far < _FAR if self.millimetres else near > _FAR
         self._doubted = self._doubted + 1 if doubted else 0
         if self._doubted >= _SCANS:
             self.millimetres, self._doubted = not self.millimetres, 0
         low, high = scan.range_min, scan.range_max
         if not self.millimetres:
-            if not _LEAST_LIMIT_M < low > far > 0.0:
+            if not (_LEAST_LIMIT_M < low > far > 0.0 or 0.0 < high < middle):
                 return scan
-            self._below += 1
+            self._beyond += 1
             return replace(scan, range_min=0.0, range_max=0.0)
         low = 0.001 * low if low > _LEAST_LIMIT_M else low
         high = 0.001 * high if high > max(near, _FAR) else high
@@ -52,14 +52,15 @@ class RangeUnit:
         """In words; nothing where ranges and limits are in metres."""
         if self.millimetres:
             return "its ranges are in millimetres: taken so"
-        return "its smallest range is above what it measures: its limits are not used" if self._below >= _SCANS else ""
+        return "most of what it measures is beyond its limits: they are not used" if self._beyond >= _SCANS else ""
 
 
-def _nearly_all(ranges: np.ndarray) -> tuple[float, float]:
-    """Between which nearly all ranges lie; 0 and 0 where these are few, or alike."""
+def _quantiles(ranges: np.ndarray) -> tuple[float, float, float]:
+    """Between which nearly all ranges lie, with their median in the middle; 0 where these are few, or alike."""
     seen = ranges[np.isfinite(ranges) & (ranges > 0.0)]
     if len(seen) < _FEWEST or len(np.unique(seen)) < _DISTINCT * len(seen):
-        return 0.0, 0.0
+        return 0.0, 0.0, 0.0
     least = round(_NEARLY_ALL * len(seen))
-    near, far = np.partition(seen, (least, len(seen) - 1 - least))[[least, -1 - least]]
-    return float(near), float(far)
+    at = [least, len(seen) // 2, len(seen) - 1 - least]
+    near, middle, far = np.partition(seen, at)[at].tolist()
+    return near, middle, far

@@ -5,8 +5,7 @@ from dataclasses import replace
 from ngo_estimator.frontend.intake.no_return import NoReturnValues
 from ngo_estimator.frontend.intake.own_returns import OwnReturns
 from ngo_estimator.frontend.intake.range_unit import RangeUnit
-from ngo_estimator.frontend.intake.repeated_scans import RepeatedScans
-from ngo_estimator.frontend.intake.single_scanner import SingleScanner
+from ngo_estimator.frontend.intake.single_scanner import MotionSince, SingleScanner
 from ngo_estimator.frontend.intake.sweep import MeasuredSweep
 from ngo_estimator.geometry.planar_motion import Array
 from ngo_recordings.scan_stream import LidarScan
@@ -18,16 +17,17 @@ class Scanner:
     def __init__(self) -> None:
         self.sweep = MeasuredSweep()
         """How long it sweeps and which way."""
-        self._repeated = RepeatedScans()
         self._single = SingleScanner()
         self._unit = RangeUnit()
         self._no_return = NoReturnValues()
         self._own = OwnReturns()
 
-    def correct(self, scan: LidarScan, min_range_m: float) -> LidarScan | None:
+    def correct(
+        self, scan: LidarScan, min_range_m: float, driven: MotionSince = lambda from_ns: None
+    ) -> LidarScan | None:
         """The scan as it should be, without ranges below ``min_range_m``; None where it is the last one again,
-        or of another scanner."""
-        if self._repeated.repeats(scan) or not self._single.counts(scan):
+        though the robot has ``driven``, or of another scanner."""
+        if not self._single.counts(scan, driven):
             return None
         scan = self._unit.metres(scan)
         if scan.range_min < min_range_m:
@@ -54,7 +54,7 @@ class Scanner:
         if self._no_return.values:
             values = ", ".join(f"{value:g}" for value in self._no_return.values)
             lines.append(f"{name} says {values} m where nothing came back: taken so")
-        told = self._unit.remark(), self._repeated.remark(), self._single.remark(), self.sweep.remark()
+        told = self._unit.remark(), *self._single.remarks(), self.sweep.remark()
         lines += [f"{name}: {line}" for line in told if line]
         if self._own.rays:
             lines.append(f"{self._own.rays} rays of {name} see the robot itself: left out")

@@ -19,7 +19,7 @@ from ngo_estimator.geometry.scan_points import Mounting
 from ngo_recordings.scan_stream import LidarScan
 
 _UNITS = (1.0, 1e-3, 1e-6, 1e-9)
-"""Drivers give the time from ray to ray in s, ms, us or ns."""
+"""Drivers give the time from ray to ray in s, ms, us or ns, or that of the whole sweep."""
 
 _LONGEST = 1.2
 _SHORTEST = 0.02
@@ -134,11 +134,20 @@ class MeasuredSweep:
         given_s, period_s = scan.time_increment * len(scan.ranges), self._period_s
         if given_s == 0.0 or period_s == 0.0:
             return given_s
-        for unit in _UNITS:
-            if _SHORTEST * period_s <= abs(given_s * unit) <= _LONGEST * period_s:
-                self.unit = unit
-                return given_s * unit
-        return given_s if abs(given_s) < period_s else 0.0
+        units = [
+            unit
+            for unit in (*_UNITS, 1.0 / len(scan.ranges))
+            if _SHORTEST * period_s <= abs(given_s * unit) <= _LONGEST * period_s
+        ]
+        if not units:
+            return given_s if abs(given_s) < period_s else 0.0
+        full_s = self._full_s(scan)
+        self.unit = 1.0 if 1.0 in units else min(units, key=lambda unit: abs(math.log(abs(given_s * unit) / full_s)))
+        return given_s * self.unit
+
+    def _full_s(self, scan: LidarScan) -> float:
+        """The time of the sweep (s) of a scanner that turns evenly, a turn a scan."""
+        return self._period_s * min(abs(scan.angle_increment) * len(scan.ranges) / math.tau, 1.0)
 
     def observe(self, stamp_ns: int, step: Array, motion: Array | None, elapsed_s: float, mounting: Mounting) -> None:
         """Take the motion ``(3,)`` that led to a scan: by the scans, and by the wheels where there are any."""
@@ -210,7 +219,7 @@ class MeasuredSweep:
         if believed_s != 0.0 and 0.0 <= measured / believed_s <= 1.0:
             return
         given_s = self._given_s(scan)
-        full_s = self._period_s * min(abs(scan.angle_increment) * len(scan.ranges) / math.tau, 1.0)
+        full_s = self._full_s(scan)
         near = [t for t in (given_s, -given_s, full_s, -full_s, 0.0) if abs(t - measured) < _NEAR * self._period_s]
         known_s = near[0] if near else float(measured)
         self.reversed = known_s == -given_s

@@ -329,6 +329,10 @@ class CorrectedWheels:
         begin, end = self._at(self._poses, from_ns), self._at(self._poses, to_ns)
         return None if self.frozen or begin is None or end is None else between(begin, end)
 
+    def since(self, from_ns: int) -> Array | None:
+        """The motion ``(3,)`` from a stamp to the newest pose; None where it is not known."""
+        return self.motion(from_ns, self._poses[-1][0]) if self._poses else None
+
     def turn(self, from_ns: int, to_ns: int) -> float | None:
         """The turn between two stamps as the wheels say it (rad); None where it is not known."""
         begin, end = self._at(self._raw, from_ns), self._at(self._raw, to_ns)
