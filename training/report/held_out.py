@@ -8,7 +8,6 @@ from typing import Any
 
 import numpy as np
 import torch
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from torch import Tensor
 from tqdm import tqdm
@@ -24,6 +23,7 @@ from training.recordings.recording_features import features_of_track
 from training.recordings.recording_source import NO_LOOPS, RecordedArguments, open_recorded
 from training.recordings.recording_tracks import Track
 from training.report.error_table import print_errors
+from training.report.pictures import panels, save
 from training.report.training_records import learning_curve
 from training.scoring.metrics import path_length_m, trajectory_error
 from training.scoring.online_estimate import online_poses, with_origin
@@ -119,9 +119,7 @@ def draw(out: Path, run: Path, estimates: list[tuple[Track, Poses]]) -> list[Pat
     truth = seen_from_first(track.poses_xyyaw)
     shown = {kind: poses[kind] for kind in ("odometry", "corrected")}
     save_plot(paths[0], f"held out, {len(track)} frames", shown, truth)
-    figure = Figure(figsize=(8.0, 4.6), layout="constrained")
-    FigureCanvasAgg(figure)
-    axes = figure.subplots()
+    figure, (axes,) = panels(1, 1, 8.0, 4.6)
     for kind, estimate in poses.items():
         if kind == _MEAN_STEP:  # so far off that nothing else could be seen
             continue
@@ -130,10 +128,10 @@ def draw(out: Path, run: Path, estimates: list[tuple[Track, Poses]]) -> list[Pat
     axes.set(xlabel="frame", ylabel="distance from the truth, m", title="held out")
     axes.grid(alpha=0.3)
     axes.legend(frameon=False)
-    figure.savefig(paths[1], dpi=110)
+    save(figure, paths[1], dpi=110)
     if (curves := learning_curves(run)) is not None:
         paths.append(out / "learning.png")
-        curves.savefig(paths[2], dpi=110)
+        save(curves, paths[2], dpi=110)
     return paths
 
 
@@ -147,11 +145,8 @@ def learning_curves(run: Path) -> Figure | None:
                 found.append((title, curve, column, label))
     if not found:
         return None
-    figure = Figure(figsize=(5.2 * len(found), 4.2), layout="constrained")
-    FigureCanvasAgg(figure)
-    for axes, (title, curve, column, label) in zip(
-        figure.subplots(1, len(found), squeeze=False)[0], found, strict=True
-    ):
+    figure, across = panels(len(found), len(found), 5.2, 4.2)
+    for axes, (title, curve, column, label) in zip(across, found, strict=True):
         axes.plot(curve["epoch"] + 1, curve[column], ".-", color=TRUTH)
         if "odometry_m" in curve:
             axes.axhline(float(curve["odometry_m"][-1]), color=COLORS["odometry"], linestyle=":", label="odometry")
