@@ -27,6 +27,7 @@ from ngo_explorer.settings import RULES, DriveConfig, ExplorerConfig
 from ngo_sim.floor_plans import FloorPlanConfig
 from ngo_sim.maze2d import Maze2DConfig
 from training.common import records
+from training.common.command_line import check_among, check_at_least
 from training.data import explored_worlds
 from training.data.building_drives import BUILDING_TEST_SEEDS
 from training.data.explored_worlds import WHEELS, Building, ExploredWorld, Maze
@@ -89,17 +90,12 @@ class Arguments(Folders):
     """Seeds of the places. Rules are chosen on validation; test is for the final table alone."""
 
     def __post_init__(self) -> None:
-        if unknown := [row for row in (*self.rows, *self.own_rows) if row not in ROWS]:
-            raise ValueError(f"rows, own_rows have {', '.join(unknown)}; expected among {', '.join(ROWS)}")
+        check_among(self, rows=ROWS, own_rows=ROWS)
         if "known_tour" in self.own_rows:
             raise ValueError("own_rows has known_tour, which needs true poses; expected other rules")
         if "plans" in self.worlds and self.plans is None:
             raise ValueError("the kind plans needs --plans, which is not given")
-        if min(self.count, self.buildings) < 2 or not self.most_s > 0.0:
-            raise ValueError(
-                f"count, buildings, most_s are {self.count}, {self.buildings}, {self.most_s}; expected at least 2, and "
-                "a time"
-            )
+        check_at_least(self, count=2, buildings=2, most_s=1)
 
 
 @dataclass(frozen=True)

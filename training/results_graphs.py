@@ -23,7 +23,7 @@ from ngo_estimator.graph.corrector import CorrectedGraph, Corrector, GraphProble
 from ngo_estimator.graph.robust import Robust
 from training.baselines import graph_peers
 from training.common import records
-from training.common.command_line import run_command
+from training.common.command_line import check_among, run_command
 from training.common.records import write_at_once
 from training.report import graphs_page
 from training.scoring.graph_problems import KINDS, JudgedProblem, Online, blocks, lecture_hall, manhattan, synthetic
@@ -76,10 +76,7 @@ class Arguments:
     """Folder that gets results_graphs.md."""
 
     def __post_init__(self) -> None:
-        known = {"graphs": _ALL_GRAPHS, "kinds": (*KINDS, *(f"{kind}_place" for kind in KINDS)), "rows": ROWS}
-        for name, names in known.items():
-            if unknown := [one for one in getattr(self, name) if one not in names]:
-                raise ValueError(f"{name} has {', '.join(unknown)}; expected among {', '.join(names)}")
+        check_among(self, graphs=_ALL_GRAPHS, kinds=Arguments.kinds, rows=ROWS)
 
 
 def main(arguments: Arguments) -> dict[str, Any]:

@@ -20,7 +20,7 @@ from rich.console import Console
 from ngo_recordings import mounting, recording, scan_stream, topics
 from ngo_sim import building2d, episodes, maze2d
 from training.common import records
-from training.common.command_line import check_at_least, run_command
+from training.common.command_line import check_among, check_at_least, run_command
 from training.data import building_drives, scans, simulated_drives
 from training.data.building_drives import BUILDING_TEST_SEEDS, building_drive
 from training.data.scans import CONDITIONS
@@ -82,8 +82,7 @@ class Arguments(Folders):
     weights: Path = records.WEIGHTS / "scan"  # Folder with lidar.json, the settings of our estimators.
 
     def __post_init__(self) -> None:
-        if unknown := [row for row in self.rows if row not in ROWS]:
-            raise ValueError(f"rows has {', '.join(unknown)}; expected among {', '.join(ROWS)}")
+        check_among(self, rows=ROWS)
         check_at_least(self, buildings=2, ablation=2, mazes=2, frames=2, length_m=1)
         last = len(BUILDING_TEST_SEEDS) - _ALIASED_FIRST - max(self.buildings, self.ablation)
         if not 0 <= self.first_building <= last:

@@ -18,7 +18,7 @@ from typing import Any, Literal
 import numpy as np
 
 from training.common import records
-from training.common.command_line import run_command
+from training.common.command_line import check_among, run_command
 from training.data.lidar_changes import CHANGES, UNSEEDED
 from training.recordings.lidar_logs import logs_below, relations_of
 from training.report import stress_page
@@ -64,12 +64,7 @@ class Arguments(Folders):
     weights: Path = records.WEIGHTS / "scan"  # Folder with lidar.json, the settings of our estimators.
 
     def __post_init__(self) -> None:
-        for name, given, known in (
-            ("changes", self.changes, (*CHANGES,)),
-            ("rows", self.rows, _ROWS),
-        ):
-            if unknown := [one for one in given if one not in known]:
-                raise ValueError(f"{name} has {', '.join(unknown)}; expected among {', '.join(known)}")
+        check_among(self, changes=CHANGES, rows=_ROWS)
         if not self.seeds or min(self.seeds) < 0:
             raise ValueError(f"seeds are {self.seeds}; expected one or more, none negative")
         if not 1 <= self.drives <= 1000 or not 0.0 < self.length <= 10.0:

@@ -12,6 +12,7 @@ import torch
 from torch import Tensor, nn
 
 from ngo_estimator.checkpoint import load_network
+from ngo_estimator.data.configuration import check, check_positive
 from ngo_estimator.data.images import ImageFormat, to_network
 from ngo_estimator.networks.flownet import FlowNetConvolutions
 
@@ -40,10 +41,8 @@ class DeepVOConfig:
     symmetric: bool = False
 
     def __post_init__(self) -> None:
-        if not 0.0 < self.width <= 2.0:
-            raise ValueError(f"width is {self.width}; expected over 0 and at most 2 (1 is DeepVO)")
-        if min(self.relative_std) <= 0.0:
-            raise ValueError(f"relative_std is {self.relative_std}; expected three positive numbers")
+        check(self, "width", "over 0 and at most 2 (1 is DeepVO)", lambda x: 0.0 < x <= 2.0)
+        check_positive(self, "relative_std")
 
 
 class DeepVO(nn.Module):

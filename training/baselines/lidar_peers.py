@@ -11,6 +11,7 @@ from typing import Any
 import gtsam
 import numpy as np
 
+from ngo_estimator.data.configuration import check, check_positive
 from ngo_estimator.geometry.scan_points import Mounting
 from ngo_estimator.graph.relative_poses import RelativePoses
 from ngo_recordings.scan_stream import LidarScan
@@ -34,11 +35,8 @@ class GraphPeerConfig:
     inlier_probability: float = 0.99
 
     def __post_init__(self) -> None:
-        if not 0.0 < self.cauchy < math.inf or not 0.0 < self.inlier_probability < 1.0:
-            raise ValueError(
-                f"cauchy, inlier_probability are {self.cauchy}, {self.inlier_probability}; expected a positive width, "
-                "and a probability between 0 and 1"
-            )
+        check_positive(self, "cauchy")
+        check(self, "inlier_probability", "between 0 and 1", lambda x: 0.0 < x < 1.0)
 
 
 def solve_lm(steps: RelativePoses, loops: RelativePoses, start: np.ndarray, config: GraphPeerConfig) -> np.ndarray:
@@ -125,9 +123,7 @@ class KissConfig:
     threshold_m: float = 0.3
 
     def __post_init__(self) -> None:
-        values = (self.voxel_m, self.range_m, self.threshold_m)
-        if not all(0.0 < value < math.inf for value in values):
-            raise ValueError(f"voxel_m, range_m, threshold_m are {values}; expected positive numbers")
+        check_positive(self, "voxel_m range_m threshold_m")
 
 
 def kiss_icp(scans: tuple[LidarScan, ...], mounting: Mounting, config: KissConfig) -> np.ndarray:

@@ -13,6 +13,7 @@ import gtsam
 import numpy as np
 import torch
 
+from ngo_estimator.data.configuration import check, check_positive
 from ngo_estimator.geometry import se2
 from ngo_estimator.loops.loop_closure import LoopSearch
 from ngo_estimator.ngo.pose_aggregation import block_variances, frame_poses, poses_in_blocks
@@ -53,19 +54,17 @@ class PoseGraphSettings:
     0 the graph starts with a convex kernel instead."""
 
     def __post_init__(self) -> None:
-        for name, value in vars(self).items():
-            if name.endswith(("_scale", "_width")) and not 0.0 < value < math.inf:
-                raise ValueError(f"{name} is {value}; expected a positive number")
-            if name in ("odometry_gain", "odometry_bias") and (len(value) != 3 or not np.isfinite(value).all()):
-                raise ValueError(f"{name} is {value}; expected three finite numbers (x, y, turn)")
-        if self.kernel not in ("none", *_KERNELS):
-            raise ValueError(f"kernel is {self.kernel!r}; expected none or one of {', '.join(_KERNELS)}")
-        if not 0.0 <= self.drift_m < math.inf:
-            raise ValueError(f"drift_m is {self.drift_m}; expected 0 or more")
-        if math.isnan(self.min_logit):
-            raise ValueError("min_logit is nan; expected a number")
-        if self.block < 1:
-            raise ValueError(f"block is {self.block}; expected at least 1")
+        check_positive(self, "odometry_position_scale odometry_heading_scale loop_position_scale loop_heading_scale")
+        check_positive(self, "kernel_width")
+        check(self, "odometry_gain odometry_bias", "finite numbers", math.isfinite)
+        if not len(self.odometry_gain) == len(self.odometry_bias) == 3:
+            raise ValueError(
+                f"odometry_gain, odometry_bias are {self.odometry_gain}, {self.odometry_bias}; expected x, y, turn"
+            )
+        check(self, "kernel", f"none or one of {', '.join(_KERNELS)}", lambda kernel: kernel in ("none", *_KERNELS))
+        check(self, "drift_m", "0 or more", lambda x: 0.0 <= x < math.inf)
+        check(self, "min_logit", "a number", lambda x: not math.isnan(x))
+        check(self, "block", "at least 1", lambda x: x >= 1)
 
     def calibrated(self, relative: np.ndarray) -> np.ndarray:
         """Steps ``(..., 3)`` of the odometry after the constant calibration, float64."""

@@ -3,7 +3,7 @@
 import logging
 import sys
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from typing import TypeVar
 
 import tyro
@@ -38,6 +38,13 @@ def check_at_least(arguments: object, **least: int) -> None:
     for name, smallest in least.items():
         if not (given := getattr(arguments, name)) >= smallest:
             raise ValueError(f"{name} is {given}; expected {smallest} or more")
+
+
+def check_among(arguments: object, **known: Collection[str]) -> None:
+    """Raise ``ValueError`` for a field of arguments that names something that there is not."""
+    for name, names in known.items():
+        if unknown := [one for one in getattr(arguments, name) if one not in names]:
+            raise ValueError(f"{name} has {', '.join(unknown)}; expected among {', '.join(names)}")
 
 
 def quiet_framework() -> None:

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from ngo_estimator.data.configuration import check
 from ngo_estimator.graph.corrector import GraphProblem
 from ngo_estimator.graph.relative_poses import RelativePoses
 from ngo_estimator.graph.robust import Robust
@@ -23,10 +24,8 @@ class WrongLoopsConfig:
     seeds: Sequence[int] = (0, 1, 2)
 
     def __post_init__(self) -> None:
-        if not 0.0 < self.percent < 100.0 or not self.seeds:
-            raise ValueError(
-                f"percent, seeds are {self.percent}, {self.seeds}; expected between 0 and 100, and a seed at least"
-            )
+        check(self, "percent", "between 0 and 100", lambda x: 0.0 < x < 100.0)
+        check(self, "seeds", "one or more, from 0 on", lambda x: x >= 0)
 
 
 def with_wrong_loops(loops: RelativePoses, nodes: int, percent: float, rng: np.random.Generator) -> RelativePoses:

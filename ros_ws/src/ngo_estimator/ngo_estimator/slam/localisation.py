@@ -14,6 +14,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from ngo_estimator.data.configuration import check, check_positive
 from ngo_estimator.data.relative_step import RelativeStep
 from ngo_estimator.geometry.planar_covariance import position_std, propagate
 from ngo_estimator.geometry.se2 import compose
@@ -59,19 +60,11 @@ class LocalisationConfig:
     """Deviation of the position past which a pose is lost (places)."""
 
     def __post_init__(self) -> None:
-        names = ("look_deg", "least_support", "sure_support", "lost_places")
-        if not all(0.0 < getattr(self, name) < math.inf for name in names):
-            raise ValueError(f"{', '.join(names)} are {[getattr(self, n) for n in names]}; expected positive numbers")
-        if self.window < 2:
-            raise ValueError(f"window is {self.window}; expected at least 2")
-        ways = (self.least_way_places, self.sure_way_places)
-        if not all(0.0 <= way < math.inf for way in ways):
-            raise ValueError(f"least_way_places, sure_way_places are {ways}; expected lengths from 0 on")
-        if not (0.0 <= self.most_rival < 1.0 and 0.0 <= self.least_share <= 1.0):
-            raise ValueError(
-                f"most_rival, least_share are {self.most_rival}, {self.least_share}; expected shares of one, the first "
-                "below one"
-            )
+        check_positive(self, "look_deg least_support sure_support lost_places")
+        check(self, "window", "at least 2", lambda x: x >= 2)
+        check(self, "least_way_places sure_way_places", "finite, from 0 on", lambda x: 0.0 <= x < math.inf)
+        check(self, "most_rival", "a share of 0 to below 1", lambda x: 0.0 <= x < 1.0)
+        check(self, "least_share", "a share of 0 to 1", lambda x: 0.0 <= x <= 1.0)
 
 
 @dataclass(frozen=True)
