@@ -21,12 +21,12 @@ INLIER_PROBABILITY = 0.99
 STEP_LIMIT = 100.0
 """Squared residual above which a step is an outlier: odometry fails far less often than loops do."""
 
-Told = Callable[[str], None]
-"""Is told how far a solution has come, in a few words."""
+Progress = Callable[[str], None]
+"""Takes how far a solution has come, in a few words."""
 
 
 def silent(_: str) -> None:
-    """Tell nobody."""
+    """Report to nobody."""
 
 
 @dataclass(frozen=True)

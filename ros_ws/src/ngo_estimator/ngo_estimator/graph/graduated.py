@@ -6,7 +6,7 @@ loop or does not. How many stages there are follows from the graph's own largest
 
 import numpy as np
 
-from ngo_estimator.graph.corrector import STEP_LIMIT, GraphProblem, Told, normal_equations, silent, thresholds
+from ngo_estimator.graph.corrector import STEP_LIMIT, GraphProblem, Progress, normal_equations, silent, thresholds
 from ngo_estimator.graph.normal_equations import GraphStructure
 
 _GROWTH = 1.4
@@ -34,7 +34,7 @@ def graduate(
     poses: np.ndarray,
     control: float | None = None,
     steps_break: bool = False,
-    told: Told = silent,
+    report: Progress = silent,
     structure: GraphStructure | None = None,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Poses ``(nodes, 3)``, and weights of loops ``(loops,)`` and of steps ``(nodes - 1,)``, from poses on.
@@ -63,7 +63,7 @@ def graduate(
         if steps_break:
             off = problem.steps.squared(poses) / STEP_LIMIT
             step_weights = np.maximum(_weights(off, control), _LEAST_WEIGHT)
-        told(f"graduated non-convexity, stage {stage + 1}: {(squared <= 1.0).sum()} of {len(squared)} loops fit")
+        report(f"graduated non-convexity, stage {stage + 1}: {(squared <= 1.0).sum()} of {len(squared)} loops fit")
         decided, moved = _weights(squared, control), np.abs(step).max()
         if moved < _LEAST_STEP and ((decided < 0.01) | (decided > 0.99)).all():
             break

@@ -27,7 +27,7 @@ _SMALL, _OFTEN = 0.115, 0.05
 so large a share of all is, variances are no larger than stated: these may be loops that repeat the odometry."""
 
 _ROUNDS = 12  # of expectation and maximisation, for the inlier ratio
-_TOLD = 0.1  # log odds that a chain's prediction has at least where it comes true
+_INFORMATIVE = 0.1  # log odds that a chain's prediction has at least where it comes true
 _FEW = 30  # loops from which on a scale and an inlier ratio are estimated
 _LARGEST = 50.0  # log odds of one cycle, either way
 
@@ -59,8 +59,8 @@ def scale_and_inlier_ratio(chain: ChainUncertainty, loops: RelativePoses, area: 
     """
     squared, logs = chain.off_chain(loops)
     # A chain that says no more than "on the map", as behind a step that nobody measured, measures no scale.
-    told = likelihood_ratio(np.zeros(len(loops)), logs, loops.degrees, area) > _TOLD
-    squared, logs, degrees = squared[told], logs[told], loops.degrees[told]
+    informative = likelihood_ratio(np.zeros(len(loops)), logs, loops.degrees, area) > _INFORMATIVE
+    squared, logs, degrees = squared[informative], logs[informative], loops.degrees[informative]
     if len(squared) < _FEW:
         return 1.0, 0.5
     best = (-math.inf, 1.0, 0.5)

@@ -14,7 +14,7 @@ import numpy as np
 from ngo_estimator.graph.corrector import (
     CorrectedGraph,
     GraphProblem,
-    Told,
+    Progress,
     normal_equations,
     silent,
     thresholds,
@@ -61,13 +61,13 @@ class Robust:
     """A ``Corrector`` by graduated non-convexity and by belief in the surest loops first.
 
     Args:
-        told: is told in a few words what has been done, as often as poses move.
+        report: takes in a few words what has been done, as often as poses move.
         least_scale: variances are not taken to be smaller than so many times the stated ones. Where edges err together,
             as neighbouring scans do, small residuals do not say that covariances are stated too large.
     """
 
-    def __init__(self, told: Told = silent, least_scale: float = LEAST_SCALE) -> None:
-        self._told, self._least_scale = told, least_scale
+    def __init__(self, report: Progress = silent, least_scale: float = LEAST_SCALE) -> None:
+        self._report, self._least_scale = report, least_scale
 
     def correct(self, problem: GraphProblem, start: CorrectedGraph | None = None) -> CorrectedGraph:
         """Solve a problem; see ``Corrector``.
@@ -85,11 +85,11 @@ class Robust:
             chain = chain_poses(problem.steps.relative, problem.poses[0])
             return CorrectedGraph(problem, chain, np.zeros(0), np.ones(len(problem.steps)), 0.0)
         if start is None or len(start.loop_weights) == 0:
-            return _from_nothing(problem, self._told, self._least_scale)
-        warm = _warm(problem, start, self._told, self._least_scale)
+            return _from_nothing(problem, self._report, self._least_scale)
+        warm = _warm(problem, start, self._report, self._least_scale)
         if loops < _GROWN * start.loops_from_nothing:
             return warm
-        anew = _from_nothing(problem, self._told, self._least_scale)
+        anew = _from_nothing(problem, self._report, self._least_scale)
         better = truncated_cost(problem, warm.poses, anew.scale, anew.scale) < anew.cost
         return replace(warm, loops_from_nothing=loops) if better else anew
 
@@ -102,7 +102,7 @@ def with_copies_once(problem: GraphProblem) -> GraphProblem:
     return replace(problem, trust=problem.trust / copies[which.ravel()])
 
 
-def _from_nothing(problem: GraphProblem, told: Told, least_scale: float) -> CorrectedGraph:
+def _from_nothing(problem: GraphProblem, report: Progress, least_scale: float) -> CorrectedGraph:
     """The best of the solutions that begin at the chain."""
     area, scale, inlier_ratio = map_area(problem.poses), 1.0, 0.5
     chain, scaled = chain_poses(problem.steps.relative, problem.poses[0]), problem
@@ -119,18 +119,18 @@ def _from_nothing(problem: GraphProblem, told: Told, least_scale: float) -> Corr
         orders = [_spread(scaled.loops.nodes, odds, cell) for cell in _CELLS]
     for order in orders:
         likely, structure = _affordable(begun, order[:count])
-        solutions.append(graduate(likely, chain, told=told, structure=structure)[0])
+        solutions.append(graduate(likely, chain, report=report, structure=structure)[0])
         if len(likely.loops) == count or metric.any():
             nothing = np.zeros(len(likely.loops), bool)
-            solutions.append(believe(likely, chain, nothing, area, inlier_ratio, told, structure)[0])
+            solutions.append(believe(likely, chain, nothing, area, inlier_ratio, report, structure)[0])
             break
     different = {scaled.fits(poses).tobytes(): poses for poses in solutions}  # what believes the same ends at the same
-    solutions += [_looked_again(scaled, poses, area, inlier_ratio, told) for poses in different.values()]
+    solutions += [_second_look(scaled, poses, area, inlier_ratio, report) for poses in different.values()]
     best = min(solutions, key=lambda poses: truncated_cost(scaled, poses))
     fits, let_in = scaled.fits(best)[~metric], odds[~metric] > 0.0
     if not metric.all() and (fits & let_in).sum() <= _AGREE * (fits | let_in).sum():
         everything, structure = _affordable(begun, orders[0])
-        poses = graduate(everything, chain, told=told, structure=structure)[0]
+        poses = graduate(everything, chain, report=report, structure=structure)[0]
         best = min(best, poses, key=lambda poses: truncated_cost(scaled, poses))
     solution = _polished(problem, best, scale, len(problem.loops), least_scale)
     # Cycles with the chain have its errors in common and measure a scale roughly; residuals of the solution do it well.
@@ -139,14 +139,16 @@ def _from_nothing(problem: GraphProblem, told: Told, least_scale: float) -> Corr
     return solution
 
 
-def _looked_again(problem: GraphProblem, poses: np.ndarray, area: float, inlier_ratio: float, told: Told) -> np.ndarray:
+def _second_look(
+    problem: GraphProblem, poses: np.ndarray, area: float, inlier_ratio: float, report: Progress
+) -> np.ndarray:
     """Poses after what they predict has let more loops in: a cycle with a long chain ruled some out that are right."""
     misfit = problem.loops.squared(poses) / thresholds(problem.loops)
     nearest, structure = _affordable(replace(problem, poses=poses), np.argsort(misfit, kind="stable"))
-    return believe(nearest, poses, nearest.fits(poses), area, inlier_ratio, told, structure)[0]
+    return believe(nearest, poses, nearest.fits(poses), area, inlier_ratio, report, structure)[0]
 
 
-def _warm(problem: GraphProblem, start: CorrectedGraph, told: Told, least_scale: float) -> CorrectedGraph:
+def _warm(problem: GraphProblem, start: CorrectedGraph, report: Progress, least_scale: float) -> CorrectedGraph:
     """The solution that the last one leads to."""
     nodes, old = len(start.poses), len(start.loop_weights)
     since = chain_poses(problem.steps.relative[nodes - 1 :], start.poses[-1])
@@ -156,7 +158,7 @@ def _warm(problem: GraphProblem, start: CorrectedGraph, told: Told, least_scale:
     # A loop that was refused is asked again where it fits, or when all are.
     asked = np.flatnonzero(believed | scaled.fits(poses) | (np.arange(len(believed)) >= old))
     part = replace(scaled, loops=scaled.loops[asked], trust=scaled.trust[asked])
-    poses, _ = believe(part, poses, believed[asked], map_area(poses), told=told)
+    poses, _ = believe(part, poses, believed[asked], map_area(poses), report=report)
     return _polished(problem, poses, start.scale, start.loops_from_nothing, least_scale)
 
 

@@ -8,7 +8,7 @@ import math
 
 import numpy as np
 
-from ngo_estimator.graph.corrector import GraphProblem, Told, normal_equations, silent, thresholds
+from ngo_estimator.graph.corrector import GraphProblem, Progress, normal_equations, silent, thresholds
 from ngo_estimator.graph.loop_evidence import predicted_odds
 from ngo_estimator.graph.normal_equations import GraphStructure
 
@@ -41,7 +41,7 @@ def believe(
     believed: np.ndarray,
     area: float,
     inlier_ratio: float = 0.5,
-    told: Told = silent,
+    report: Progress = silent,
     structure: GraphStructure | None = None,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Poses ``(nodes, 3)`` and which loops are believed ``(loops,)``, beginning with those that are.
@@ -71,7 +71,7 @@ def believe(
         new = np.flatnonzero(odds > _LEAST_ODDS)
         if len(new) == 0 and not left.any() and np.abs(step).max() < _AT_REST:
             break
-        told(f"the surest loops first, round {round_ + 1}: {believed.sum()} of {len(believed)} loops are believed")
+        report(f"the surest loops first, round {round_ + 1}: {believed.sum()} of {len(believed)} loops are believed")
         most = max(_AT_LEAST, int(_SHARE * len(new)), int(_ADDED * believed.sum()))
         believed[rows[left]] = False
         believed[rows[new[np.argsort(-odds[new], kind="stable")[:most]]]] = True
