@@ -64,16 +64,16 @@ class Watched:
         self.block = self.core.block
         self.optimisations = Times()
         self._given: tuple[MetaSteps, Loops] | None = None
-        iterate, graph = optimizer.iterate, self.core._back_end
-        optimise = graph._optimise
+        graph = self.core._back_end
+        optimise, finder = graph._optimise, graph._finder
+        assert finder is not None, "expected an optimizer with loops"
 
-        def remembered(steps: MetaSteps, loops: Loops | None = None, *others: Any) -> Any:
-            assert loops is not None, "expected an optimizer with loops"
-            self._given = (steps, loops)
-            return iterate(steps, loops, *others)
+        def remembered() -> None:
+            loops = finder.loops[finder.chosen()]
+            self._given = graph._meta_steps(), finder.for_optimizer(loops, np.ones(len(loops), bool))
+            self.optimisations.take(optimise)
 
-        vars(optimizer)["iterate"] = remembered
-        vars(graph)["_optimise"] = lambda: self.optimisations.take(optimise)
+        vars(graph)["_optimise"] = remembered
 
     def problem(self) -> Problem:
         """What the optimizer was given last."""

@@ -76,6 +76,10 @@ def test_old_blocks_are_left_out_and_new_ones_are_stiff_and_not_adjusted() -> No
         assert not correction.adjustment[0, 2:].any()
         for new in correction.stiffness[0, 2:]:
             np.testing.assert_array_equal(new, given.stiffness[iteration, -1])
+    adjustments, stiffness = zip(*given.for_blocks(6, 10), strict=True)
+    summed = given.summed(6, 10)
+    np.testing.assert_array_equal(summed[0], sum(adjustments)[0])
+    np.testing.assert_array_equal(summed[1], stiffness[-1][0])
 
 
 def test_they_are_restored_as_they_were() -> None:

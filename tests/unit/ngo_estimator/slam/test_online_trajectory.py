@@ -478,13 +478,14 @@ def test_with_answers_first_loops_are_judged_anew_more_often_than_the_network_ru
 ) -> None:
     optimizer, kinds = small_optimizer("loops", True), []
     core = OnlineTrajectory(optimizer, small_pair_head(), 1200, iterations_per_step=1)
-    iterate = optimizer.iterate
+    iterate, resume = optimizer.iterate, core._back_end._resume
 
-    def kind(steps: object, loops: object, corrections: object, solution: object) -> object:
-        kinds.append("network" if corrections is None else "anew" if solution is None else "resumed")
-        return iterate(steps, loops, corrections, solution)
+    def kind(steps: object, loops: object, corrections: object) -> object:
+        kinds.append("network" if corrections is None else "anew")
+        return iterate(steps, loops, corrections)
 
     monkeypatch.setattr(optimizer, "iterate", kind)
+    monkeypatch.setattr(core._back_end, "_resume", lambda *given: (kinds.append("resumed"), resume(*given))[1])
     for step in make_steps(1600):
         core.update(step)
     core.finish()

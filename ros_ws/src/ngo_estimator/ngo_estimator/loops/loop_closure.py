@@ -113,9 +113,9 @@ class Loops:
             raise ValueError(f"loops have {sorted(mine)}, others {sorted(theirs)}; expected the same fields")
         return self._with({name: torch.cat((value, theirs[name]), dim=1) for name, value in mine.items()})
 
-    def of_single(self, which: np.ndarray | slice = slice(None)) -> Loops:
-        """Those of the only trajectory, of these indices, as arrays ``(loops, ...)``."""
-        return self._with({name: value[0].numpy()[which] for name, value in self._per_loop().items()})
+    def of_single(self) -> Loops:
+        """Those of the only trajectory as arrays ``(loops, ...)``."""
+        return self._with({name: value[0].numpy() for name, value in self._per_loop().items()})
 
     def _per_loop(self) -> dict[str, Tensor]:
         return {name: value for name in _PER_LOOP if (value := getattr(self, name)) is not None}

@@ -336,11 +336,11 @@ class PlaceLoopFinder:
         variance = np.diagonal(self._graph.step_covariance[:keys], axis1=1, axis2=2)
         self.loops = self.loops.thinned(keep, self._graph.poses[:keys], variance, self._begins)
 
-    def for_optimizer(self) -> tuple[Loops, np.ndarray]:
-        """The loops for the optimizer, and which of ``loops`` these are."""
-        kept, window, begins = self.loops, len(self._keys), self._begins
+    def chosen(self) -> np.ndarray:
+        """Which of ``loops`` ``(n,)`` the optimizer is given."""
+        kept, window = self.loops, len(self._keys)
         within, behind = kept.start >= window, kept.end <= window
-        rows = np.concatenate(
+        return np.concatenate(
             (
                 np.flatnonzero(behind),
                 kept.best(np.flatnonzero(~within & ~behind), _MOST_TO_KEY_FRAMES),
@@ -348,9 +348,17 @@ class PlaceLoopFinder:
                 kept.best(np.flatnonzero(within & kept.overlap), self._search.overlaps),
             )
         )
-        at_ends = self._embeddings.slice(int(begins[window]), int(begins[-1]))[self._block - 1 :: self._block]
-        length = np.diff(begins[kept.pairs[rows]])[:, 0] // self._block
-        return kept[rows].for_optimizer(length, at_ends), rows
+
+    def lengths(self, loops: PlaceLoops) -> np.ndarray:
+        """Blocks on each loop ``(n,)``."""
+        lengths: np.ndarray = (self._begins[loops.end] - self._begins[loops.start]) // self._block
+        return lengths
+
+    def for_optimizer(self, loops: PlaceLoops, valid: np.ndarray) -> Loops:
+        """The loops as the networks take them; which of them are ``valid`` ``(n,)``."""
+        first, last = (int(self._begins[node]) for node in (len(self._keys), -1))
+        at_ends = self._embeddings.slice(first, last)[self._block - 1 :: self._block]
+        return loops.for_optimizer(self.lengths(loops), valid, at_ends)
 
     def weigh(self, rows: np.ndarray, weights: np.ndarray, information: np.ndarray) -> None:
         """Keep the optimizer's weights ``(n,)`` and information ``(n, 3)`` of these loops."""
@@ -369,9 +377,9 @@ class PlaceLoopFinder:
         self.loops = self.loops[~chosen]
         return int(chosen.sum())
 
-    def edges(self, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def edges(self, loops: PlaceLoops) -> tuple[np.ndarray, np.ndarray]:
         """Frames that these loops join ``(n, 2)``, and the later one seen from the earlier ``(n, 3)``."""
-        loops, odometry = self.loops[rows], self._odometry
+        odometry = self._odometry
         frames = loops.frames(self._begins)
         in_block = all_between(odometry[self._begins[loops.start]], odometry[frames[:, 0]])
         return frames, all_between(in_block, loops.relative)

@@ -111,11 +111,11 @@ class PlaceLoops(LoopRecord):
         forward = (self.start >= 0) & (self.start < self.end) & (self.frame >= -1)
         require(bool(forward.all()), "a loop does not lead from an earlier node to a later one")
 
-    def for_optimizer(self, length: np.ndarray, embeddings: np.ndarray) -> Loops:
+    def for_optimizer(self, length: np.ndarray, valid: np.ndarray, embeddings: np.ndarray) -> Loops:
         """The record in float32.
 
         Args:
-            length: blocks on each loop ``(n,)``.
+            length: blocks on each loop ``(n,)``; valid: which of them may count ``(n,)``.
             embeddings: of the frames at the ends of the window's blocks ``(blocks, embedding_size)``.
         """
 
@@ -131,7 +131,7 @@ class PlaceLoops(LoopRecord):
             spread=single(self.spread),
             logit=single(np.maximum(self.logit, -20.0)),
             similarity=single(self.similarity),
-            valid=torch.ones(1, len(self), dtype=torch.bool),
+            valid=_batch(valid),
             embeddings=_batch(embeddings),
             by_poses=_batch(self.overlap),
             length=_batch(length),

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
@@ -22,7 +22,7 @@ from ngo_estimator.ngo.loop_gates import (
     odometry_variances,
     unchained,
 )
-from ngo_estimator.ngo.meta_poses import GraphState, MetaSteps, OptimizedMetaPoses, Solution
+from ngo_estimator.ngo.meta_poses import GraphState, MetaSteps, OptimizedMetaPoses
 
 if TYPE_CHECKING:
     from ngo_estimator.graph.normal_equations import GraphStructure, NormalEquations
@@ -32,9 +32,6 @@ OVERLAPS_AFTER = 2
 
 CHANNELS = 7
 """Channels in which the convolutions see the loops: spread residual, deviation (three each) and support."""
-
-_LEAST_WEIGHT = 1e-4
-"""Of a loop that an earlier solution knew: one of less weight has no share in the equations."""
 
 
 class NoLoopClosing:
@@ -68,7 +65,6 @@ class LoopClosing:
         find_overlaps: gives further loops under corrected poses ``(batch, poses + 1, 3)``, or None.
         odometry_noise: ``(3,)`` factors between the deviations of ``steps`` and those of the odometry's real errors.
         correction_std: ``(3,)`` unit of residuals and deviations for the convolutions.
-        solution: an earlier one, whose trust in the loops that it knew stays; only new ones are judged.
     """
 
     def __init__(
@@ -79,18 +75,10 @@ class LoopClosing:
         find_overlaps: Callable[[Tensor], Loops | None],
         odometry_noise: Tensor,
         correction_std: Tensor,
-        solution: Solution | None = None,
     ) -> None:
         self._keys, self._find_overlaps, self._correction_std = steps.key_frames, find_overlaps, correction_std
         self._gate, self._is_single = gate, is_single(steps)
         self._std, self._noise = self._given(steps.std), self._given(odometry_noise)
-        self._new: np.ndarray | None = None
-        self._weights: Any
-        self._information: Any
-        if solution is not None:
-            self._new = np.flatnonzero(~solution.known)
-            self._weights, self._information = solution.weights.clip(0.0), solution.information.clip(0.0)
-            self._shared = np.where(solution.known, solution.weights >= _LEAST_WEIGHT, loops.valid[0].numpy())
         self._take(loops)
         self._equations: NormalEquations | None = None
         self._begun = False
@@ -98,14 +86,7 @@ class LoopClosing:
     def _take(self, loops: Loops) -> None:
         self._loops = loops
         self._structure: GraphStructure | None = None
-        if self._new is not None and not len(self._new):
-            return
-        self._judged: Any = loops
-        if self._is_single and self._new is None:
-            self._judged = loops.of_single()
-            self._shared = self._judged.valid
-        elif self._new is not None:
-            self._judged = loops.of_single(self._new)
+        self._judged: Any = loops.of_single() if self._is_single else loops
 
     def _given(self, tensor: Tensor) -> Any:
         """Values of this batch, or arrays of the only trajectory."""
@@ -134,8 +115,11 @@ class LoopClosing:
         """Judge the loops under the current poses; the third iteration adds overlaps to them."""
         if iteration == OVERLAPS_AFTER and (overlaps := self._find_overlaps(state.poses)) is not None:
             self._take(self._loops.and_also(overlaps))
-        adjusted, deviation, step_std = (self._given(x) for x in (state.adjusted, state.deviation, state.step_std))
-        self._look(adjusted, deviation, step_std, iteration)
+        self._adjusted, self._deviation, step_std = (
+            self._given(x) for x in (state.adjusted, state.deviation, state.step_std)
+        )
+        self._poses = chained(self._adjusted + self._deviation)
+        self._weights, self._information = judged(self._gate, self._judged, self._poses, step_std, iteration)
 
     def close(self, state: GraphState, stiffness: Tensor) -> GraphState:
         """Take a Gauss-Newton step from the poses of the last ``look``, so that the gated loops close.
@@ -144,55 +128,13 @@ class LoopClosing:
             stiffness: ``(batch, blocks, 3)`` or ``(3,)``: logarithm of a factor of the odometry's deviations, which is
                 then limited to -3 to 3.
         """
-        step_std = self._softened(stiffness)
-        deviation = self._close(step_std)
-        return replace(state, deviation=self._returned(deviation), step_std=self._returned(step_std))
-
-    def resume(
-        self, adjusted: Tensor, stiffness: Tensor, relative: Tensor, iterations: Sequence[int]
-    ) -> tuple[Tensor, Tensor]:
-        """Corrected relative poses and deviations of the steps, both ``(1, poses, 3)``, by a warm start.
-
-        Args:
-            adjusted: relative poses ``(1, poses, 3)`` with all adjustments; stiffness: as of ``close``.
-            relative: those of the earlier solution.
-            iterations: as which the loops that it did not know are judged.
-        """
-        own, step_std, softened = self._given(adjusted), self._std, self._softened(stiffness)
-        deviation = se2.wrapped(self._given(relative) - own)
-        for iteration in iterations:
-            self._look(own, deviation, step_std, iteration)
-            deviation, step_std = self._close(softened), softened
-        return self._returned(own + deviation), self._returned(softened)
-
-    def _look(self, adjusted: Any, deviation: Any, step_std: Any, iteration: int) -> None:
-        self._adjusted, self._deviation, self._poses = adjusted, deviation, chained(adjusted + deviation)
-        if self._new is not None and not len(self._new):
-            return
-        loops, poses = self._judged, self._poses
-        expected = odometry_variances(loops.nodes, poses, step_std**2)
-        if loops.most_drift is not None:
-            expected = library(expected).minimum(expected, loops.most_drift)
-        residuals = loop_residuals(loops.nodes, loops.measured, poses)
-        judged = self._gate.judged(loops, residuals, expected, iteration)
-        if self._new is None:
-            self._weights, self._information = judged
-        else:
-            self._weights[self._new], self._information[self._new] = judged
-
-    def _softened(self, stiffness: Tensor) -> Any:
-        """Deviations ``(..., poses, 3)`` with which the odometry is believed."""
-        of = library(self._std)
-        factor = of.exp(3.0 * of.tanh(self._given(stiffness) / 3.0)) * self._noise
-        return of.concatenate((self._std[..., : self._keys, :], self._std[..., self._keys :, :] * factor), axis=-2)
-
-    def _close(self, step_std: Any) -> Any:
-        """What loops change in the relative poses ``(..., poses, 3)`` after a Gauss-Newton step."""
         self._begun = True
+        step_std = softened(self._std, self._given(stiffness), self._noise, self._keys)
         # It begins at the poses under which the loops were judged, before the network adjusted the odometry.
         solve = self._sparse_step if self._is_single else self._dense_step
         after = self._poses + solve(1.0 / step_std**2)
-        return se2.wrapped(unchained(after) - self._adjusted)
+        deviation = se2.wrapped(unchained(after) - self._adjusted)
+        return replace(state, deviation=self._returned(deviation), step_std=self._returned(step_std))
 
     def _dense_step(self, odometry: Tensor) -> Tensor:
         """Changes ``(batch, poses + 1, 3)`` of all poses, with gradients; ``odometry`` is the steps' information."""
@@ -214,7 +156,7 @@ class LoopClosing:
         from ngo_estimator.graph import normal_equations as sparse
 
         if self._structure is None:
-            self._used = np.flatnonzero(self._shared)
+            self._used = np.flatnonzero(self._judged.valid)
             self._measured = self._loops.measured[0].double().numpy()[self._used]
             chain = np.arange(len(odometry))
             ends = self._loops.start[0].numpy(), self._loops.end[0].numpy() + 1
@@ -245,6 +187,22 @@ class LoopClosing:
             of.log1p(support),
         )
         return self._returned(of.concatenate(seen, axis=-1)).to(state.features)
+
+
+def judged(gate: RobustLoopGate, loops: Any, poses: Values, step_std: Values, iteration: int) -> tuple[Any, Any]:
+    """Gate and information of loops under poses ``(..., poses + 1, 3)``; see ``RobustLoopGate.judged``."""
+    expected = odometry_variances(loops.nodes, poses, step_std**2)
+    if loops.most_drift is not None:
+        expected = library(expected).minimum(expected, loops.most_drift)
+    return gate.judged(loops, loop_residuals(loops.nodes, loops.measured, poses), expected, iteration)
+
+
+def softened(std: Values, stiffness: Values, noise: Values, keys: int) -> Values:
+    """Deviations ``(..., poses, 3)`` with which the odometry is believed; the first ``keys`` stay as they are."""
+    of = library(std)
+    factor = of.exp(3.0 * of.tanh(stiffness / 3.0)) * noise
+    believed: Values = of.concatenate((std[..., :keys, :], std[..., keys:, :] * factor), axis=-2)
+    return believed
 
 
 def spread_over_span(nodes: Values, values: Values, weights: Values, steps: int) -> tuple[Values, Values]:

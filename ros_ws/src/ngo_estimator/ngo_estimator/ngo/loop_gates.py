@@ -104,30 +104,23 @@ def _compiled() -> Any:
     return loop_errors
 
 
-def without_contradictions(loops: Loops, steps: MetaSteps, which: np.ndarray | None = None) -> Loops:
+def without_contradictions(loops: Loops, steps: MetaSteps) -> Loops:
     """The loops; those that contradict the odometry between their poses are not valid any more.
 
     What odometry alone says is tested, before anything is corrected: corrections by wrong loops make room for others.
-
-    Args:
-        which: indices of the loops of the only trajectory that are tested, by default all.
     """
-    if which is not None and not len(which):
-        return loops
     with torch.no_grad():
         if not is_single(steps):
-            held = _hold(loops.nodes, loops.measured.double(), steps.relative.double(), steps.std.double())
+            held = holds(loops.nodes, loops.measured.double(), steps.relative.double(), steps.std.double())
             return dataclasses.replace(loops, valid=loops.valid & held)
-        tested = slice(None) if which is None else which
-        start, end, measured = (x[0].numpy()[tested] for x in (loops.start, loops.end, loops.measured))
+        nodes, measured = loops.nodes[0].numpy(), loops.measured[0].numpy()
         relative, std = (x[0].double().numpy() for x in (steps.relative, steps.std))
-        valid = loops.valid.clone()
-        valid[0].numpy()[tested] &= _hold(np.stack((start, end + 1), axis=-1), measured, relative, std)
-        return dataclasses.replace(loops, valid=valid)
+        held = torch.from_numpy(holds(nodes, measured, relative, std))
+        return dataclasses.replace(loops, valid=loops.valid & held)
 
 
-def _hold(nodes: Values, measured: Values, relative: Values, std: Values) -> Values:
-    """Which loops ``(..., loops)`` do not contradict the odometry."""
+def holds(nodes: Values, measured: Values, relative: Values, std: Values) -> Values:
+    """Which loops ``(..., loops)`` do not contradict an odometry, ``relative`` and ``std`` ``(..., poses, 3)``."""
     poses = chained(relative)
     variance = odometry_variances(nodes, poses, std.clip(LEAST_STD) ** 2)
     squared = (loop_residuals(nodes, measured, poses) ** 2 / variance.clip(_LEAST_VARIANCE)).sum(-1)

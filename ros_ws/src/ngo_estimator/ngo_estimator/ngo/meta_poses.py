@@ -85,24 +85,6 @@ class GraphState:
         return with_origin(se2.r2g(self.relative))
 
 
-class Solution(NamedTuple):
-    """Where an earlier optimisation of one trajectory ended.
-
-    ``relative`` ``(1, poses, 3)``, float64. ``weights`` ``(loops,)`` and ``information`` ``(loops, 3)`` of the loops
-    that the optimizer is given now, both negative for those that it was not given then.
-    """
-
-    relative: Tensor
-    weights: Array
-    information: Array
-
-    @property
-    def known(self) -> Array:
-        """Which loops it was given then ``(loops,)``."""
-        known: Array = self.information[:, 0] >= 0.0
-        return known
-
-
 class Correction(NamedTuple):
     """What the network gives in one iteration: adjustments ``(batch, blocks, 3)``, and the stiffness of this shape."""
 
@@ -147,6 +129,29 @@ class OptimizedMetaPoses:
             for nodes, information in measured
         ]
         return node_covariance(factors, poses.shape[1], poses.shape[1] - 1)
+
+
+class Solution(NamedTuple):
+    """Where the optimisation of one trajectory ended, in arrays.
+
+    ``poses`` ``(poses + 1, 3)``, the origin in front; ``step_std`` ``(poses, 3)``; ``weights`` ``(loops,)`` and
+    ``information`` ``(loops, 3)``, none without loops; ``end`` ``(3, 3)`` is the covariance of the last pose.
+    """
+
+    poses: Array
+    step_std: Array
+    weights: Array
+    information: Array
+    end: Array
+
+    @classmethod
+    def of(cls, result: OptimizedMetaPoses) -> Solution:
+        """The same of the only trajectory of a batch."""
+        beliefs = result.loop_weights, result.loop_information
+        weights, information = (torch.zeros(1, 0) if belief is None else belief for belief in beliefs)
+        poses = with_origin(se2.r2g(result.meta_relative[-1].double()))
+        of_batch = poses, result.step_std, weights, information, result.end_covariance()
+        return cls(*(tensor[0].double().numpy() for tensor in of_batch))
 
 
 @dataclass(frozen=True)

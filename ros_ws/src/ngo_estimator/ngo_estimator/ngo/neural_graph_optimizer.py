@@ -18,11 +18,11 @@ from torch import Tensor, nn
 from ngo_estimator.data.configuration import check, check_positive
 from ngo_estimator.loops.loop_closure import Loops, LoopSearch, find_loops
 from ngo_estimator.loops.overlaps import find_overlaps
+from ngo_estimator.loops.place_loops import PlaceLoops
 from ngo_estimator.networks.odometry_smoothing import OdometrySmoother, SmootherConfig
 from ngo_estimator.networks.place_encoder import PairHead
-from ngo_estimator.ngo import warm_start
 from ngo_estimator.ngo.attention_network import AttentionConfig, AttentionNetwork, AttentionPhases
-from ngo_estimator.ngo.loop_closing import CHANNELS, LoopClosing, NoLoopClosing
+from ngo_estimator.ngo.loop_closing import CHANNELS, LoopClosing, NoLoopClosing, softened
 from ngo_estimator.ngo.loop_gates import RobustLoopGate, without_contradictions
 from ngo_estimator.ngo.loop_judge import LoopJudge
 from ngo_estimator.ngo.meta_poses import (
@@ -40,6 +40,7 @@ from ngo_estimator.ngo.pose_aggregation import (
     poses_in_blocks,
 )
 from ngo_estimator.ngo.registered_odometry import registered_steps
+from ngo_estimator.ngo.warm_start import Remembered, resumed
 
 _Channels = Callable[[GraphState], Tensor]
 
@@ -214,15 +215,12 @@ class NeuralGraphOptimizer(AttentionNetwork):
         steps: MetaSteps,
         loops: Loops | None = None,
         corrections: Sequence[Correction] | None = None,
-        solution: Solution | None = None,
     ) -> Iterator[OptimizedMetaPoses]:
         """Run the M iterations one by one, and yield the result after each; only the last one has its loops.
 
         Args:
             corrections: what the network gave in each iteration of an earlier optimisation, to be taken instead of
                 running it.
-            solution: of an optimisation that took these corrections, to go on from. There is one result then, for a
-                single trajectory on the CPU without gradients. The belief in loops stays; only new ones are judged.
 
         Raises:
             ValueError: loops for an optimizer without loops, or none for one with loops.
@@ -230,18 +228,37 @@ class NeuralGraphOptimizer(AttentionNetwork):
         if self.config.loops != (loops is not None):
             given = "none were given" if loops is None else "loops were given"
             raise ValueError(f"{given} to an optimizer with{'' if self.config.loops else 'out'} loops")
-        if loops is None:
-            return self._annealed(steps, NoLoopClosing(), self._phases(steps, loops, corrections))
-        if corrections is not None and solution is not None:
-            closing = self._loop_closing(steps, loops, solution)
-            return warm_start.resumed(closing, steps, corrections, solution, self.config.iterations)
-        return self._annealed(steps, self._loop_closing(steps, loops), self._phases(steps, loops, corrections))
+        closing = NoLoopClosing() if loops is None else self._loop_closing(steps, loops)
+        return self._annealed(steps, closing, self._phases(steps, loops, corrections))
+
+    def resume(
+        self,
+        relative: np.ndarray,
+        std: np.ndarray,
+        given: tuple[np.ndarray, np.ndarray],
+        loops: PlaceLoops,
+        new_loops: Loops,
+        poses: np.ndarray,
+    ) -> Solution:
+        """Go on from a solution; ``resumed`` describes it.
+
+        New loops are judged as in the first iteration, which allows for the odometry's drift, and then as in the last.
+
+        Args:
+            relative, std: of the odometry ``(poses, 3)``; given: what the network adjusts of its last poses in all
+                iterations, and the last stiffness of these, both ``(blocks, 3)``.
+        """
+        adjusted, keys = relative.copy(), len(relative) - len(given[0])
+        adjusted[keys:] += given[0]
+        step_std = softened(std, given[1], self.odometry_noise.double().numpy(), keys)
+        iterations = 0, self.config.iterations - 1
+        return resumed(self.loop_gate, iterations, (relative, std), adjusted, step_std, loops, new_loops, poses)
 
     def _annealed(
         self,
         steps: MetaSteps,
         closing: LoopClosing | NoLoopClosing,
-        phases: AttentionPhases | _NoNetwork | warm_start.Remembered,
+        phases: AttentionPhases | _NoNetwork | Remembered,
     ) -> Iterator[OptimizedMetaPoses]:
         """The results that begin at the odometry Delta P^(0).
 
@@ -265,11 +282,11 @@ class NeuralGraphOptimizer(AttentionNetwork):
 
     def _phases(
         self, steps: MetaSteps, loops: Loops | None, corrections: Sequence[Correction] | None
-    ) -> AttentionPhases | _NoNetwork | warm_start.Remembered:
+    ) -> AttentionPhases | _NoNetwork | Remembered:
         if not self.config.network:
             return _NoNetwork(self)
         if corrections is not None:
-            return warm_start.Remembered(corrections)
+            return Remembered(corrections)
         similarity = None if loops is None else loops.embeddings @ loops.embeddings.mT
         return self.phases(steps.blocks, similarity, self.correction_std)
 
@@ -281,19 +298,14 @@ class NeuralGraphOptimizer(AttentionNetwork):
         found = find_overlaps(loops.scans, steps.in_blocks, poses, loops.embeddings, search)
         return without_contradictions(found, steps)
 
-    def _loop_closing(self, steps: MetaSteps, loops: Loops, solution: Solution | None = None) -> LoopClosing:
-        # Known loops were tested before; where others must agree with a new one, all are looked at.
-        which = None
-        if solution is not None and not self.config.search.least_belief:
-            which = np.flatnonzero(~solution.known)
-        loops = self._judged(without_contradictions(loops, steps, which), steps)
+    def _loop_closing(self, steps: MetaSteps, loops: Loops) -> LoopClosing:
+        loops = self.judged(loops, steps)
         find_overlaps = partial(self.overlaps, steps, loops)
-        return LoopClosing(
-            self.loop_gate, steps, loops, find_overlaps, self.odometry_noise, self.correction_std, solution
-        )
+        return LoopClosing(self.loop_gate, steps, loops, find_overlaps, self.odometry_noise, self.correction_std)
 
-    def _judged(self, loops: Loops, steps: MetaSteps) -> Loops:
-        least = self.config.search.least_belief
+    def judged(self, loops: Loops, steps: MetaSteps) -> Loops:
+        """The loops as they are closed: none that contradicts the odometry, or that the judge refuses."""
+        loops, least = without_contradictions(loops, steps), self.config.search.least_belief
         return self.loop_judge.judged(loops, steps, least) if least else loops
 
 

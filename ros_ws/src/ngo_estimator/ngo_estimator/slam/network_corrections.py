@@ -33,6 +33,14 @@ class NetworkCorrections:
         """Number of the first block that the network did not see."""
         return self.first + self.stiffness.shape[1]
 
+    def summed(self, first: int, last: int) -> tuple[np.ndarray, np.ndarray]:
+        """All adjustments, and the last stiffness, both ``(blocks, 3)``, float64; see ``for_blocks``."""
+        adjustment, stiffness = np.zeros((last - first, 3)), np.empty((last - first, 3))
+        seen = self.last - first
+        self.adjustment[:, first - self.first :].sum(0, out=adjustment[:seen])
+        stiffness[:seen], stiffness[seen:] = self.stiffness[-1, first - self.first :], self.stiffness[-1, -1]
+        return adjustment, stiffness
+
     def for_blocks(self, first: int, last: int) -> list[Correction]:
         """The same for the blocks ``first`` to ``last`` (not included): newer ones are no less stiff than the last."""
         stiffness, adjustment = self.stiffness[:, first - self.first :], self.adjustment[:, first - self.first :]

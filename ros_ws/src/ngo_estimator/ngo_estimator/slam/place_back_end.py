@@ -12,10 +12,9 @@ import torch
 from ngo_estimator.data.relative_step import UNFAMILIAR, RelativeStep, check_step
 from ngo_estimator.data.state_arrays import require
 from ngo_estimator.geometry import se2
-from ngo_estimator.geometry.planar_motion import all_between, chained
+from ngo_estimator.geometry.planar_motion import all_between
 from ngo_estimator.graph.key_frames import KeyFrame, KeyFrames
 from ngo_estimator.graph.pose_graph import PoseGraph
-from ngo_estimator.loops.loop_closure import Loops
 from ngo_estimator.loops.place_loop_finder import PlaceLoopFinder
 from ngo_estimator.loops.place_loops import PlaceLoops
 from ngo_estimator.networks.place_encoder import PairHead
@@ -184,48 +183,77 @@ class PlaceBackEnd(BackEnd):
     @torch.inference_mode()
     def _optimise(self) -> None:
         """Optimise all nodes of the window and the key frames before it."""
-        odometry, first, blocks = self._odometry, self._first, self._odometry.blocks
-        relative = self.graph.relative.astype(np.float32)
-        std = np.sqrt(np.diagonal(self.graph.step_covariance, axis1=1, axis2=2)).astype(np.float32)
-        known = None if self._network_is_due else self._corrections
-        runs_network = self._optimizer.config.network and known is None
-        features = None
-        if runs_network:
-            features = torch.from_numpy(odometry.features.slice(first)).unsqueeze(0)
-        steps = MetaSteps(
-            torch.from_numpy(relative).unsqueeze(0), torch.from_numpy(std).unsqueeze(0), features, blocks - first
-        )
-        if (fixed := odometry.fixed.slice(first)).any():
-            steps = replace(steps, fixed=torch.from_numpy(fixed.copy()).unsqueeze(0))
-        loops, rows, solution = None, np.zeros(0, np.int64), None
+        loops, rows, result = PlaceLoops.none(), np.zeros(0, np.int64), None
         if self._finder is not None:
-            loops, rows = self._finder.for_optimizer()
-            loops = self._verified(loops)
-            if not self._annealing_is_due:
-                known_loops, poses = self._finder.loops[rows], self.graph.poses
-                steps_solved = torch.from_numpy(all_between(poses[:-1], poses[1:])).unsqueeze(0)
-                solution = Solution(steps_solved, known_loops.weight, known_loops.information)
-        corrections = None if known is None else known.for_blocks(first, blocks)
-        *_, result = self._optimizer.iterate(steps, loops, corrections, solution)
-        end = self._scale * result.end_covariance()[0].numpy()
-        require_sound(result.meta_relative[-1].numpy(), end)
-        self._apply(result, rows, end)
-        if solution is None:
-            self._annealed = blocks
-        if runs_network and self._network_every > 1:
-            self._corrections = NetworkCorrections.of(first, result.corrections)
+            rows = self._finder.chosen()
+            loops = self._finder.loops[rows]
+        runs_network = self._optimizer.config.network and self._network_is_due
+        if self._finder is None or self._annealing_is_due:
+            result = self._anneal(loops)
+            solution = Solution.of(result)
+        else:
+            solution = self._resume(self._finder, loops)
+        solution = solution._replace(end=self._scale * solution.end)
+        require_sound(solution.poses, solution.end)
+        self._apply(solution, loops, rows)
+        if result is not None:
+            self._annealed = self._odometry.blocks
+            if runs_network and self._network_every > 1:
+                self._corrections = NetworkCorrections.of(self._first, result.corrections)
 
-    def _verified(self, loops: Loops) -> Loops:
-        """The same loops; none across a blind stretch where place codes alone show them.
+    def _anneal(self, loops: PlaceLoops) -> OptimizedMetaPoses:
+        """Optimise from the odometry on, with these loops; the network runs if it is due."""
+        steps, given, corrections, first = self._meta_steps(), None, None, self._first
+        if not self._network_is_due:
+            corrections = self._corrections.for_blocks(first, self._odometry.blocks)
+        elif self._optimizer.config.network:
+            steps = replace(steps, features=torch.from_numpy(self._odometry.features.slice(first)).unsqueeze(0))
+        if self._finder is not None:
+            given = self._finder.for_optimizer(loops, self._verified(loops))
+        *_, result = self._optimizer.iterate(steps, given, corrections)
+        return result
+
+    def _resume(self, finder: PlaceLoopFinder, loops: PlaceLoops) -> Solution:
+        """Go on from the last solution, with these loops, of which only new ones are judged."""
+        valid = self._verified(loops)
+        if self._optimizer.config.search.least_belief:  # others must agree with a new one: all are looked at
+            judged = self._optimizer.judged(finder.for_optimizer(loops, valid), self._meta_steps())
+            valid, logit, log_scale = (of[0].numpy() for of in (judged.valid, judged.logit, judged.log_scale))
+            loops = replace(loops, logit=logit, log_scale=log_scale)
+        adjustment, stiffness = self._corrections.summed(self._first, self._odometry.blocks)
+        if (fixed := self._odometry.fixed.slice(self._first)).any():
+            adjustment[fixed] = stiffness[fixed] = 0.0
+        new = np.flatnonzero(loops.information[:, 0] < 0.0)
+        new_loops = finder.for_optimizer(loops[new], valid[new]).of_single()
+        given, odometry = (adjustment, stiffness), (self.graph.relative, self._step_std)
+        return self._optimizer.resume(*odometry, given, loops, new_loops, self.graph.poses)
+
+    @property
+    def _step_std(self) -> np.ndarray:
+        """Deviations ``(nodes - 1, 3)`` of the steps between nodes."""
+        std: np.ndarray = np.sqrt(np.diagonal(self.graph.step_covariance, axis1=1, axis2=2))
+        return std
+
+    def _meta_steps(self) -> MetaSteps:
+        """All steps between nodes as the networks take them, without features."""
+        values = self.graph.relative, self._step_std
+        relative, std = (torch.from_numpy(of.astype(np.float32)).unsqueeze(0) for of in values)
+        fixed = self._odometry.fixed.slice(self._first)
+        stays = torch.from_numpy(fixed.copy()).unsqueeze(0) if fixed.any() else None
+        return MetaSteps(relative, std, None, len(fixed), fixed=stays)
+
+    def _verified(self, loops: PlaceLoops) -> np.ndarray:
+        """Which loops ``(n,)`` may count; none across a blind stretch where place codes alone show them.
 
         Nothing limits the motion within it, so that each place that looks alike would do.
         """
         search = self._optimizer.config.search
         if search.registrations or search.least_belief or not self._odometry.blind.any():
-            return loops
+            return np.ones(len(loops), bool)
         blind = (summed_variances(self._odometry.blind, self._blocks_before) > 0.0).any(axis=1)
-        before = torch.from_numpy(np.concatenate(([0], blind.cumsum())))
-        return replace(loops, valid=loops.valid & (before[loops.end + 1] == before[loops.start]))
+        before = np.concatenate(([0], blind.cumsum()))
+        verified: np.ndarray = before[loops.end] == before[loops.start]
+        return verified
 
     @property
     def _network_is_due(self) -> bool:
@@ -244,18 +272,16 @@ class PlaceBackEnd(BackEnd):
             return True
         return is_due(self._odometry.blocks - self._annealed, self._annealed - first, self._anneal_every)
 
-    def _apply(self, result: OptimizedMetaPoses, rows: np.ndarray, end: np.ndarray) -> None:
-        """Take the result; how far the last node is from it adds to its covariance ``end``."""
-        if self._finder is not None and result.loop_weights is not None and result.loop_information is not None:
-            weight, information = (of[0].double().numpy() for of in (result.loop_weights, result.loop_information))
-            std = 1.0 / np.sqrt(np.maximum(information, _LEAST_INFORMATION))
-            self.closed = ClosedLoops(*self._finder.edges(rows), std, weight)
-            self._finder.weigh(rows, weight, information)
-        solution = chained(result.meta_relative[-1][0].double().numpy())
-        poses = self._shrink(solution)
-        moved = poses[-1] - solution[-1]
-        self.graph.move(poses, end + np.outer(moved, moved))
-        self._odometry.optimized_std.replace(self._first, result.step_std[0, len(self._keys) :].double().numpy())
+    def _apply(self, solution: Solution, loops: PlaceLoops, rows: np.ndarray) -> None:
+        """Take the solution with the loops of these ``rows``; its last node has more variance, by how far it is off."""
+        if self._finder is not None:
+            std = 1.0 / np.sqrt(np.maximum(solution.information, _LEAST_INFORMATION))
+            self.closed = ClosedLoops(*self._finder.edges(loops), std, solution.weights)
+            self._finder.weigh(rows, solution.weights, solution.information)
+        poses = self._shrink(solution.poses)
+        moved = poses[-1] - solution.poses[-1]
+        self.graph.move(poses, solution.end + np.outer(moved, moved))
+        self._odometry.optimized_std.replace(self._first, solution.step_std[len(self._keys) :])
 
     def _shrink(self, solution: np.ndarray) -> np.ndarray:
         """Poses of all nodes ``(nodes, 3)``, whose corrections are shrunk across blind stretches."""
