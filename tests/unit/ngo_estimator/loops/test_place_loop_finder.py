@@ -50,9 +50,12 @@ def place() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 
 def driven(
-    config: PictureLoopConfig, drift_rad: float, std_rad: float, rough: float = 0.0
+    config: PictureLoopConfig, drift_rad: float, std_rad: float, rough: float = 0.0, belief: float = 0.0
 ) -> tuple[PictureLoopFinder, np.ndarray]:
-    """A finder after one and a half rounds with an odometry that turns too far, and the true poses."""
+    """A finder after one and a half rounds with an odometry that turns too far, and the true poses.
+
+    No loop moves the graph, whatever the ``belief`` in it is.
+    """
     points, looks, truth = place()
     finder, graph = PictureLoopFinder(config), PoseGraph()
     finder.append(seen(truth[0], points, looks, 0.0))
@@ -60,7 +63,7 @@ def driven(
         graph.append(se2.between(before, pose) + (0.0, 0.0, drift_rad), np.diag((1e-4, 1e-4, std_rad**2)))
         graph.add_node()
         finder.append(seen(pose, points, looks, rough if len(finder) > ROUND else 0.0))
-        finder.find(graph)
+        finder.find(graph, np.full(len(finder.loops), belief))
     return finder, truth
 
 
@@ -106,6 +109,17 @@ def test_what_is_measured_roughly_is_no_loop() -> None:
 def test_a_graph_that_is_sure_of_another_place_takes_no_loop() -> None:
     finder, _ = driven(PictureLoopConfig(), drift_rad=0.02, std_rad=1e-4)
     assert len(finder.loops) == 0
+
+
+@pytest.mark.parametrize(("std_rad", "taken"), [(0.002, True), (0.1, False)])
+def test_as_many_deviations_off_a_loop_is_taken_where_the_graph_knows_more(std_rad: float, taken: bool) -> None:
+    finder, _ = driven(PictureLoopConfig(), drift_rad=0.5 * std_rad, std_rad=std_rad)
+    assert (len(finder.loops) > 0) == taken
+
+
+def test_only_loops_that_are_believed_make_the_graph_surer() -> None:
+    refused, believed = (driven(PictureLoopConfig(), 0.002, 0.01, belief=belief)[0].loops for belief in (0.0, 1.0))
+    assert 0 < len(believed) < len(refused)  # what contradicts the believed ones is not taken
 
 
 def test_old_pictures_are_let_go() -> None:

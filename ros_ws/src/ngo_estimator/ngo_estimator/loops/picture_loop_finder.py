@@ -1,5 +1,7 @@
 """Finds loops of key pictures without training: what looks alike near where the robot may be, verified by geometry."""
 
+import math
+
 import numpy as np
 
 from ngo_estimator.data.state_arrays import Arrays, flat, part, require, restore, split, state_of, under
@@ -7,8 +9,10 @@ from ngo_estimator.geometry import se2
 from ngo_estimator.geometry.key_picture import KeyPicture, nothing_seen
 from ngo_estimator.geometry.planar_motion import turned_covariance
 from ngo_estimator.geometry.view_pose import RangedRays
+from ngo_estimator.graph.loop_evidence import likelihood_ratio, map_area
 from ngo_estimator.graph.path_covariance import path_covariances
 from ngo_estimator.graph.pose_graph import PoseGraph
+from ngo_estimator.graph.relative_poses import BELIEVED
 from ngo_estimator.graph.segments import segment_of
 from ngo_estimator.loops.picture_fit import PictureFit, fit, points_of
 from ngo_estimator.loops.picture_loops import PictureLoops
@@ -39,15 +43,18 @@ class PictureLoopFinder:
             self._pictures[old] = nothing_seen()
             self._points.pop(old, None)
 
-    def find(self, graph: PoseGraph) -> int:
-        """Look for loops of the last node; returns how many were found."""
+    def find(self, graph: PoseGraph, belief: np.ndarray) -> int:
+        """Look for loops of the last node; returns how many were found.
+
+        ``belief`` ``(n,)`` is in the first loops, with which the graph was solved: only believed ones make it surer.
+        """
         node, found = len(self._pictures) - 1, PictureLoops.none()
-        others, covariances = self._candidates(graph)
+        others, covariances = self._candidates(graph, self.loops[np.flatnonzero(belief > BELIEVED)])
         for other, covariance in zip(others.tolist(), covariances, strict=True):
             turn = float(se2.wrap(graph.poses[node, 2] - graph.poses[other, 2]))
             near = turn, self.config.turn_rad + self.config.deviations * float(np.sqrt(covariance[2, 2]))
             fitted = self.fitted(other, self._pictures[node], graph, near)
-            if fitted is None or self._surprises(fitted, graph.poses[[other, node]], covariance):
+            if fitted is None or not self._expected(fitted, graph.poses, (other, node), covariance):
                 continue
             pair, inliers = np.array(((other, node),)), np.array((fitted.inliers,))
             found = found.extended(PictureLoops(pair, fitted.relative[None], fitted.covariance[None], inliers))
@@ -62,16 +69,24 @@ class PictureLoopFinder:
         """Where a picture was taken, seen from a node; see ``picture_fit.fit``."""
         return fit(self.config, self._pictures[node], picture, self._points_of(node, graph), near)
 
-    def _surprises(self, fitted: PictureFit, poses: np.ndarray, covariance: np.ndarray) -> bool:
-        """Whether a fit is far from where the graph has both nodes ``(2, 3)``: another place looks alike."""
-        off = se2.wrapped(fitted.relative - se2.between(*poses))
-        known = turned_covariance(-poses[0, 2], covariance) + fitted.covariance
-        return bool(off @ np.linalg.solve(known, off) > self.config.deviations**2)
+    def _expected(self, fitted: PictureFit, poses: np.ndarray, pair: tuple[int, int], covariance: np.ndarray) -> bool:
+        """Whether a fit of a pair of nodes is where their poses, among all ``(nodes, 3)``, put it.
 
-    def _candidates(self, graph: PoseGraph) -> tuple[np.ndarray, np.ndarray]:
+        Another place that looks alike may be anywhere on the map. The less the graph knows, the likelier it is within
+        the graph's deviations by chance.
+        """
+        config, (start, end) = self.config, pair
+        off = se2.wrapped(fitted.relative - se2.between(poses[start], poses[end]))
+        known = turned_covariance(-poses[start, 2], covariance) + fitted.covariance
+        squared, log = np.array(off @ np.linalg.solve(known, off)), np.array(np.linalg.slogdet(known)[1])
+        likelier = likelihood_ratio(squared, log, np.array(3), map_area(poses))
+        return bool(squared <= config.deviations**2 and likelier >= math.log(config.likelier))
+
+    def _candidates(self, graph: PoseGraph, closed: PictureLoops) -> tuple[np.ndarray, np.ndarray]:
         """Earlier nodes ``(n,)`` that look most alike, among those that may be near.
 
-        Also the covariances ``(n, 3, 3)`` with which the graph knows the last node against them, along the map's axes.
+        Also the covariances ``(n, 3, 3)`` with which the graph, and the loops that it ``closed``, know the last node
+        against them, along the map's axes.
         """
         config, node = self.config, len(self._pictures) - 1
         older = self.alike(self._pictures[node])[: max(0, node - config.recent)]
@@ -82,8 +97,8 @@ class PictureLoopFinder:
         pairs = np.stack((ranked, np.full(len(ranked), node)), axis=1)
         covariance = path_covariances(
             graph.poses,
-            np.concatenate((graph.edges, self.loops.pairs)),
-            np.concatenate((graph.step_covariance, self.loops.covariance)),
+            np.concatenate((graph.edges, closed.pairs)),
+            np.concatenate((graph.step_covariance, closed.covariance)),
             pairs,
         )
         away = np.linalg.norm(graph.poses[ranked, :2] - graph.poses[node, :2], axis=1)

@@ -19,6 +19,8 @@ class PictureLoopConfig:
     looked_at: int = 20
     # Deviations of the graph within which the robot may be, and how far apart pictures of one place are taken (m).
     deviations: float = 4.0
+    # Times that a loop must be likelier where it is, as the graph expects it, than anywhere on the map.
+    likelier: float = 100.0
     apart_m: float = 3.0
     # The second best match must be so many times as far away: a smaller ratio accepts fewer.
     ratio: float = 0.85

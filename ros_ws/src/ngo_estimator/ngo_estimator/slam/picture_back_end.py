@@ -81,7 +81,7 @@ class PictureBackEnd(BackEnd):
         return self._waiting > max(self.config.keys_between, len(self.graph) // _KEYS_PER_OPTIMISED)
 
     def _look_for_loops(self) -> None:
-        if self._finder.find(self.graph):
+        if self._finder.find(self.graph, self.closed.weight):
             self._waiting = max(self._waiting, 1)
 
     def _optimise(self) -> None:
