@@ -178,10 +178,10 @@ def seen(count: int) -> KeyScanViews:
 def test_the_key_scan_most_alike_looks_the_same_way() -> None:
     views = seen(3)
     np.testing.assert_allclose(views.at(VIEWED_FROM), ((4.0, 0.0), (-4.0, 0.0), (4.1, 0.0)), atol=1e-12)
-    assert views.most_alike(VIEWED_FROM, AHEAD, VIEWED_FROM[1]) == 1
-    assert views.most_alike(VIEWED_FROM, AHEAD, VIEWED_FROM[0]) == 0
+    assert views.most_alike(VIEWED_FROM, AHEAD, VIEWED_FROM[1])[0] == 1
+    assert views.most_alike(VIEWED_FROM, AHEAD, VIEWED_FROM[0])[0] == 0
     views.thin(np.array((False, True, True)))
-    assert views.most_alike(VIEWED_FROM[1:], AHEAD, VIEWED_FROM[0]) == 1
+    assert views.most_alike(VIEWED_FROM[1:], AHEAD, VIEWED_FROM[0])[0] == 1
 
 
 def test_views_of_a_map_leave_those_of_its_first_scans_as_they_are() -> None:

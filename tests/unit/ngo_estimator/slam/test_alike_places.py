@@ -3,6 +3,7 @@
 import numpy as np
 
 from ngo_estimator.geometry.planar_motion import between
+from ngo_estimator.geometry.se2 import between as between_all
 from ngo_estimator.loops.key_scan_views import KeyScanViews
 from ngo_estimator.loops.scan_settings import ScanLoopConfig
 from ngo_estimator.slam.scan_matcher import REACH_M, ScanMatcher
@@ -20,10 +21,10 @@ ROOM = np.concatenate(
 IN_AND_OUT = ((0.5, 1), (2.5, 1), (2.5, 4.2), (2.5, 1))
 
 
-def matcher_of(walls: np.ndarray, poses: np.ndarray) -> ScanMatcher:
+def matcher_of(walls: np.ndarray, poses: np.ndarray, reach_m: float = REACH_M) -> ScanMatcher:
     random = np.random.default_rng(0)
     scans = [scan_at(walls, pose, random) for pose in poses]
-    return ScanMatcher(scans, poses, KeyScanViews().of_map(scans), ScanLoopConfig(), REACH_M)
+    return ScanMatcher(scans, poses, KeyScanViews().of_map(scans), ScanLoopConfig(), reach_m)
 
 
 def test_rooms_that_look_alike_are_noticed_and_corners_of_a_ring_are_told_apart() -> None:
@@ -41,3 +42,15 @@ def test_a_way_is_clear_at_its_place_by_the_walls_that_it_has_in_common_with_the
     place, aside, turned = again[-1], again[-1] + (2.0, 0.0, 0.0), again[-1] + (0.0, 0.0, np.pi)
     assert matcher.is_clear(place)
     assert not any(matcher.is_clear(pose) or matcher.allows(pose) for pose in (aside, turned))
+
+
+def test_a_place_is_shown_by_key_scans_of_all_drives_in_whatever_order_they_were_left() -> None:
+    ring, random = way(*ROUND, ROUND[0]), np.random.default_rng(2)
+    aside = range(0, 400, 40)
+    walls = np.concatenate([HALLWAY + (x, 0, x, 0) for x in aside])
+    left = np.concatenate([ring[::3] + (x, 0, 0) for x in aside])
+    matcher, again = matcher_of(walls, random.permutation(left), np.inf), ring[20:24]
+    for step in lidar_steps(between_all(again[0], again), lambda k, stamp_ns: scan_at(HALLWAY, again[k], random)):
+        matcher.append(step, step.odom_xyyaw)
+    (found,) = matcher.around(again[-1] + (0.3, -0.3, 0.1)).poses
+    assert np.hypot(*between(again[-1], found)[:2]) < 0.03

@@ -66,15 +66,16 @@ class KeyScanViews:
         """Where the robot looks at poses ``(keys, 3)`` of all key scans: their middles ``(keys, 2)``, in the map."""
         return _placed(self._middles.values, poses)
 
-    def most_alike(self, poses: np.ndarray, points: np.ndarray, pose: np.ndarray) -> int:
-        """The key scan near a pose ``(3,)`` that looks where points ``(n, 2)`` seen from there are.
+    def most_alike(self, poses: np.ndarray, points: np.ndarray, pose: np.ndarray) -> np.ndarray:
+        """The key scans ``(keys,)``, those near a pose ``(3,)`` first that look where points ``(n, 2)`` from there are.
 
         A scanner does not see what is behind it. ``poses`` ``(keys, 3)`` are those of all key scans.
         """
         view = _placed(_middle(points)[None], pose[None])
         away = np.linalg.norm(poses[:, :2] - pose[:2], axis=1)
         difference = np.linalg.norm(_placed(self._middles.values, poses) - view, axis=1)
-        return int((difference + 0.5 * away).argmin())
+        order: np.ndarray = np.argsort(difference + 0.5 * away, kind="stable")
+        return order
 
     def state(self) -> Arrays:
         """All that is kept, for ``restore``."""

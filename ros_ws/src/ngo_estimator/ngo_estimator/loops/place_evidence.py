@@ -26,7 +26,7 @@ _WALL_POINTS = 4
 STRETCH_M, _PART = 20.0, 4
 """The way that is compared at most, and of how many key scans a part of it is."""
 
-_NEAR_M, _MOST_SCANS = 8.0, 60
+_NEAR_M, MOST_SCANS = 8.0, 60
 """The key scans that it is compared with: how far from it, and how many at most."""
 
 _MOST_POINTS = 2000
@@ -83,7 +83,7 @@ def evidence_of(
     views: KeyScanViews,
     stretch: tuple[np.ndarray, np.ndarray],
     others: tuple[np.ndarray, np.ndarray],
-    most_scans: int = _MOST_SCANS,
+    most_scans: int = MOST_SCANS,
     count_walls: bool = False,
 ) -> PlaceEvidence:
     """How the key scans of a stretch agree with those of others near it; both are keys and their poses ``(n, 3)``.
@@ -105,7 +105,7 @@ def evidence_at(
     views: KeyScanViews,
     stretch: tuple[np.ndarray, Callable[[slice], PlacedScans]],
     others: tuple[np.ndarray, np.ndarray],
-    most_scans: int = _MOST_SCANS,
+    most_scans: int = MOST_SCANS,
     count_walls: bool = False,
 ) -> PlaceEvidence:
     """The same of a stretch whose scans are not among ``scans``: its poses ``(n, 3)``, and what gives some of them."""

@@ -25,7 +25,7 @@ from ngo_estimator.loops.scan_loop_agreement import with_agreement
 from ngo_estimator.loops.scan_loop_candidates import loop_candidates
 from ngo_estimator.loops.scan_loops import ScanLoops
 from ngo_estimator.loops.scan_settings import ScanGraphConfig
-from ngo_estimator.loops.scan_submaps import SUBMAP_VARIANCE, ScanSubmaps, laid_together
+from ngo_estimator.loops.scan_submaps import SUBMAP_VARIANCE, ScanSubmaps, around_in_time, laid_together
 
 
 class ScanLoopFinder:
@@ -194,7 +194,8 @@ class ScanLoopFinder:
         The key is ``likely`` ``(3,)`` that near to its pose in the graph; it is searched somewhat farther.
         """
         config, key = self.config.loops, len(scans) - 1
-        submap = self._submaps.around(place, scans, self.views.profiles, poses, segments)
+        there = around_in_time(place, len(scans), config.submap_keys, segments)
+        submap = self._submaps.around(place, there, scans, self.views.profiles, poses)
         first = max(0, key + 1 - config.source_keys)
         source = laid_together(scans[first:], self.views.profiles[first:], poses[first:])
         expected = between(poses[place], poses[key])

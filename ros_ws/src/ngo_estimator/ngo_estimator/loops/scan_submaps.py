@@ -48,27 +48,18 @@ class ScanSubmaps:
     def around(
         self,
         place: int,
+        keys: np.ndarray,
         scans: Sequence[KeyScan],
         profiles: Sequence[np.ndarray],
         poses: np.ndarray,
-        segments: np.ndarray | None = None,
     ) -> Submap:
-        """The submap around a key, made of all key scans, their range profiles and their poses ``(keys, 3)``.
-
-        It holds no scan of another segment; ``segments`` are the keys with which these begin.
-        """
+        """The submap around a key, made of ``keys`` ``(n,)`` of all key scans, their range profiles and poses."""
         if place in self._submaps:
             self._submaps.move_to_end(place)
             return self._submaps[place]
-        half = self._config.submap_keys // 2
-        first, after = max(0, place - half), min(len(scans), place - half + self._config.submap_keys)
-        if segments is not None:
-            borders = np.append(segments, len(scans))
-            own = int(np.searchsorted(segments, place, side="right"))
-            first, after = max(first, int(borders[own - 1])), min(after, int(borders[own]))
-        local = se2.between(poses[place], poses[first:after])
-        submap = self._made(first, local, placed(scans[first:after], profiles[first:after], local))
-        self._submaps[place] = submap
+        local, chosen = se2.between(poses[place], poses[keys]), keys.tolist()
+        together = placed([scans[key] for key in chosen], [profiles[key] for key in chosen], local)
+        submap = self._submaps[place] = self._made(chosen[0], local, together)
         if len(self._submaps) > self._config.most_submaps:
             self._submaps.popitem(last=False)
         return submap
@@ -109,6 +100,14 @@ class ScanSubmaps:
             (place, self._made(first, local, PlacedScans(*scans)))
             for (place, first), local, *scans in zip(places.tolist(), poses, *columns, strict=True)
         )
+
+
+def around_in_time(place: int, count: int, most: int, segments: np.ndarray | None = None) -> np.ndarray:
+    """Of ``count`` key scans up to ``most`` that follow each other around one, none of another segment."""
+    borders = np.array((0, count)) if segments is None else np.append(segments, count)
+    own = int(np.searchsorted(borders, place, side="right"))
+    first = place - most // 2
+    return np.arange(max(first, int(borders[own - 1])), min(first + most, int(borders[own])))
 
 
 def laid_together(scans: Sequence[KeyScan], profiles: Sequence[np.ndarray], poses: np.ndarray) -> PlacedScans:

@@ -287,9 +287,8 @@ class ScanBackEnd(BackEnd):
 
     def matcher(self, origin: MapOrigin) -> ScanMatcher:
         """Compares scans with the key scans as they are; they lie in ``map`` as ``origin`` says."""
-        scans, graph = self._scans[:], self.graph
-        poses = origin.poses(graph.poses.copy())
-        return ScanMatcher(scans, poses, self._finder.views, self.config.loops, borders=graph.borders)
+        poses = origin.poses(self.graph.poses.copy())
+        return ScanMatcher(self._scans[:], poses, self._finder.views, self.config.loops)
 
     def localiser(self, origin: MapOrigin) -> Localiser:
         """Localises in the key scans as they are; raises ``ValueError`` where none has a point."""

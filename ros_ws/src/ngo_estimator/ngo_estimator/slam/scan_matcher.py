@@ -17,6 +17,7 @@ from ngo_estimator.geometry.key_scan import KeyScan
 from ngo_estimator.geometry.planar_motion import between, compose, transformed, turned_covariance
 from ngo_estimator.loops.key_scan_views import KeyScanViews
 from ngo_estimator.loops.place_evidence import (
+    MOST_SCANS,
     STRETCH_M,
     PlaceEvidence,
     evidence_at,
@@ -26,7 +27,7 @@ from ngo_estimator.loops.place_evidence import (
 )
 from ngo_estimator.loops.scan_fit import fit, search_points
 from ngo_estimator.loops.scan_settings import ScanLoopConfig
-from ngo_estimator.loops.scan_submaps import SUBMAP_VARIANCE, ScanSubmaps, laid_together
+from ngo_estimator.loops.scan_submaps import SUBMAP_VARIANCE, ScanSubmaps, around_in_time, laid_together
 from ngo_estimator.loops.walls_seen_through import PlacedScans, placed, range_profile
 from ngo_estimator.slam.evidence import elsewhere
 from ngo_estimator.slam.sightings import Sightings
@@ -56,7 +57,6 @@ class ScanMatcher:
         views: of these scans, or of the first of them.
         config: how a loop is searched and tested.
         reach_m: how far the robot is from one of the map's key scans at most. Anywhere, infinity, costs ten times more.
-        borders: key scans from which on scans do not lie together with those before; None: all do.
     """
 
     place_m = 1.0
@@ -70,13 +70,12 @@ class ScanMatcher:
         views: KeyScanViews,
         config: ScanLoopConfig,
         reach_m: float = math.inf,
-        borders: np.ndarray | None = None,
     ) -> None:
         points = [transformed(pose, scan.points) for pose, scan in zip(poses, scans, strict=True)]
         if sum(map(len, points)) == 0:
             raise ValueError("no key scan of the map has a point; expected a map with walls")
         self._scans, self._poses, self._views = scans, poses, views.of_map(scans)
-        self._config, self._borders = config, borders
+        self._config = config
         self._submaps = ScanSubmaps(config)
         self._ambiguous: dict[tuple[int, float], bool] = {}
         together = np.concatenate(points)
@@ -138,14 +137,12 @@ class ScanMatcher:
 
     def allows(self, pose: np.ndarray) -> bool:
         """Whether many sightings are enough: the way and the map agree there, and places around do not look alike."""
-        if not self._evidence(pose).suffices:
-            return False
-        there = int(np.linalg.norm(self._poses[:, :2] - pose[:2], axis=1).argmin())
-        half = WAY_KEYS // 2
-        return not self._is_ambiguous(max(0, min(there // half * half - half // 2, len(self._scans) - WAY_KEYS)))
+        return self._evidence(pose).suffices and not self._is_ambiguous(pose)
 
-    def _is_ambiguous(self, first: int) -> bool:
-        """Whether places look alike among the key scans from ``first`` on, to a robot that has seen as much."""
+    def _is_ambiguous(self, pose: np.ndarray) -> bool:
+        """Whether places look alike among the key scans around a pose, to a robot that has seen as much."""
+        there, half = int(np.linalg.norm(self._poses[:, :2] - pose[:2], axis=1).argmin()), WAY_KEYS // 2
+        first = max(0, min(there // half * half - half // 2, len(self._scans) - WAY_KEYS))
         way_m = stretch_length_m(np.stack(self._odometry))
         if (first, way_m) not in self._ambiguous:
             keys = slice(first, first + WAY_KEYS)
@@ -212,8 +209,12 @@ class ScanMatcher:
 
         The tests are those of a loop, but for neighbours and the graph's pose.
         """
-        place = self._views.most_alike(self._poses, source.points, expected)
-        submap = self._submaps.around(place, self._scans, self._views.profiles, self._poses, self._borders)
+        place = int(self._views.most_alike(self._poses, source.points, expected)[0])
+        there = around_in_time(place, len(self._scans), self._config.submap_keys)
+        if self._near is None:  # a saved map: of one of its drives few key scans may be left, but all are laid together
+            alike = self._views.most_alike(self._poses, self._scans[place].points, self._poses[place])
+            there = np.sort(alike[:MOST_SCANS])
+        submap = self._submaps.around(place, there, self._scans, self._views.profiles, self._poses)
         found = fit(self._config, submap, source, between(self._poses[place], expected), _AROUND)
         if found is None:
             return None
