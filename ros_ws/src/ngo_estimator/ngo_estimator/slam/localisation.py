@@ -2,7 +2,7 @@
 
 A frame is compared with the map wherever the robot has moved enough. Over a rolling window of such frames hypotheses
 of the newest pose are put together by odometry. A pose is claimed where hypotheses of several frames agree, and no
-other pose has nearly as many. A few are enough where the matcher finds the way clear there, and nowhere else. From then
+other pose has nearly as many. One is enough where the matcher finds the way clear there, and nowhere else. From then
 on a filter fuses odometry with the sightings that agree with it.
 """
 
@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -50,19 +50,15 @@ class LocalisationConfig:
     """Share of the window that must support a claim, 0 to 1."""
     least_way_places: float = 3.0
     """Path over which the support must be spread (places)."""
-    sure_support: float = 3.0
-    """Looks that are enough where the matcher finds a pose clear."""
-    sure_way_places: float = 0.5
-    """Path that is enough then (places)."""
     most_rival: float = 0.35
     """Support of another pose at most, as a share of the claim's, 0 to below 1."""
     lost_places: float = 2.0
     """Deviation of the position past which a pose is lost (places)."""
 
     def __post_init__(self) -> None:
-        check_positive(self, "look_deg least_support sure_support lost_places")
+        check_positive(self, "look_deg least_support lost_places")
         check(self, "window", "at least 2", lambda x: x >= 2)
-        check(self, "least_way_places sure_way_places", "finite, from 0 on", lambda x: 0.0 <= x < math.inf)
+        check(self, "least_way_places", "finite, from 0 on", lambda x: 0.0 <= x < math.inf)
         check(self, "most_rival", "a share of 0 to below 1", lambda x: 0.0 <= x < 1.0)
         check(self, "least_share", "a share of 0 to 1", lambda x: 0.0 <= x <= 1.0)
 
@@ -88,11 +84,7 @@ class Localiser:
     """Takes steps, and reports where in the map the robot is once that is beyond doubt."""
 
     def __init__(self, matcher: MapMatcher, config: LocalisationConfig | None = None) -> None:
-        self.config = config = config or LocalisationConfig()
-        # A way that is clear has asked all frames, and not only those with sightings.
-        self._sure = replace(
-            config, least_support=config.sure_support, least_way_places=config.sure_way_places, least_share=0.0
-        )
+        self.config = config or LocalisationConfig()
         self._hurries = True
         self._matcher = matcher
         self._window = HypothesisWindow(self.config.window)
@@ -109,7 +101,7 @@ class Localiser:
         self._modes: tuple[Mode, ...] = ()
 
     def take_time(self) -> None:
-        """Claim nothing by few sightings: their pose is right, and too rough for what is mapped from there on."""
+        """Claim nothing by one sighting: its pose is right, and too rough for what is mapped from there on."""
         self._hurries = False
 
     def set_pose(self, pose_xyyaw: np.ndarray, covariance: np.ndarray) -> None:
@@ -175,15 +167,15 @@ class Localiser:
     def _beyond_doubt(self) -> Mode | None:
         """The strongest mode, if it is the only one where the way is clear, or has many sightings."""
         matcher, strongest = self._matcher, self._modes[0]
-        few = [mode for mode in self._modes if self._hurries and self._supported(self._sure, mode, ())]
-        clear = [mode for mode in few if matcher.is_clear(mode.pose_xyyaw)]
+        # A way that is clear has asked all frames, and not only those with sightings.
+        clear = [mode for mode in self._modes if self._hurries and matcher.is_clear(mode.pose_xyyaw)]
         if len(clear) == 1 and clear[0].support >= strongest.support:
             return clear[0]
-        many = self._supported(self.config, strongest, self._modes[1:])
+        many = self._supported(strongest, self._modes[1:])
         return strongest if many and matcher.allows(strongest.pose_xyyaw) else None
 
-    def _supported(self, config: LocalisationConfig, mode: Mode, others: Sequence[Mode]) -> bool:
-        return may_claim(config, self._window, mode, others, self._matcher.place_m, len(self._window))
+    def _supported(self, mode: Mode, others: Sequence[Mode]) -> bool:
+        return may_claim(self.config, self._window, mode, others, self._matcher.place_m, len(self._window))
 
     def _contradicted(self, hypotheses: Hypotheses, agree: np.ndarray) -> bool:
         """Whether the track is lost; ``agree`` says which hypotheses agree with it."""
@@ -197,7 +189,7 @@ class Localiser:
         others = [mode for mode in self._modes if not _same(mode, self._track[0], place_m)]
         if len(others) == len(self._modes) and self._modes:
             track = Mode(*self._track, ours, np.zeros(0, np.int64))
-            return self._supported(self.config, others[0], (*others[1:], track))
+            return self._supported(others[0], (*others[1:], track))
         return False
 
 

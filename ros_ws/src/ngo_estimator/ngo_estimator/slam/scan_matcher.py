@@ -132,7 +132,7 @@ class ScanMatcher:
         return self._verified(self._source(), (expected,))
 
     def is_clear(self, pose: np.ndarray) -> bool:
-        """Whether few sightings are enough for a pose: by the walls that the way and the map have in common there."""
+        """Whether one sighting is enough for a pose: by the walls that the way and the map have in common there."""
         return self._evidence(pose).is_clear
 
     def allows(self, pose: np.ndarray) -> bool:

@@ -63,7 +63,7 @@ class MapMatcher(Protocol):
         """Hypotheses of the newest frame's pose, which should be near ``expected`` ``(3,)``."""
 
     def is_clear(self, pose: np.ndarray) -> bool:
-        """Whether few sightings are enough for a pose ``(3,)``, by what else is known of the way and the map."""
+        """Whether one sighting is enough for a pose ``(3,)``, by what else is known of the way and the map."""
 
     def allows(self, pose: np.ndarray) -> bool:
         """Whether many sightings are enough for a pose ``(3,)``; else no number of them is."""
@@ -76,7 +76,7 @@ class SightingsAlone:
     """The part of a ``MapMatcher`` that knows nothing of a pose but its sightings."""
 
     def is_clear(self, pose: np.ndarray) -> bool:
-        """Few sightings are never enough."""
+        """One sighting is never enough."""
         return False
 
     def allows(self, pose: np.ndarray) -> bool:
