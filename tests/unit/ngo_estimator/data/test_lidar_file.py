@@ -72,17 +72,12 @@ def test_a_bad_file_is_one_line(tmp_path: Path, values: Any, told: str) -> None:
 @pytest.mark.parametrize(
     ("values", "told"),
     [
-        ({"learned_deviation": True}, "'learned_deviation' in 'odometry' is gone: no network"),
-        ({"front_end": "mixture"}, "'front_end' in 'odometry' is gone: there is one front end"),
-        ({"odometry": {"key_distance_m": 0.3}}, "'odometry' in 'odometry' is gone: \"key_m\""),
-        ({"wheels": {}}, "'wheels' in 'odometry' is gone"),
         ({"key_m": 0.0}, "key_m is 0.0"),
         ({"keys_m": 0.3}, "unknown keys"),
+        ({"first_weights": [0.4, 0.2, 0.1, 0.2, 0.07, 0.03]}, "5 hypotheses"),
     ],
 )
-def test_of_a_setting_that_is_gone_one_line_says_what_replaces_it(
-    tmp_path: Path, values: dict[str, Any], told: str
-) -> None:
+def test_a_bad_setting_of_the_front_end_is_one_line(tmp_path: Path, values: dict[str, Any], told: str) -> None:
     given = folder(tmp_path, {**WHOLE, "odometry": values})
     with pytest.raises(LidarFileError, match=told) as error:
         read_mixture_config(given)

@@ -1,7 +1,6 @@
 """The file ``lidar.json`` in a folder of weights: it says that a lidar's estimators are run, and their settings."""
 
 import json
-from collections.abc import Mapping
 from importlib import import_module
 from pathlib import Path
 from typing import TypeVar
@@ -46,12 +45,8 @@ def require_opencv() -> None:
         ) from error
 
 
-def read_lidar_file(
-    weights: Path, section: str, kind: type[Config], world: str | None = None, gone: Mapping[str, str] | None = None
-) -> Config:
+def read_lidar_file(weights: Path, section: str, kind: type[Config], world: str | None = None) -> Config:
     """The settings in ``section``, ``odometry`` or ``graph``; a setting that is not there has its default.
-
-    Of one that is ``gone`` the error says what replaces it.
 
     Raises:
         LidarFileError: of one line, about what cannot be read or is unknown.
@@ -67,9 +62,6 @@ def read_lidar_file(
         raise LidarFileError(f"{path}: is not a lidar's description of format {_FORMAT}, with the keys {sorted(_KEYS)}")
     if world is not None and values["world"] != world:
         raise LidarFileError(f"{path}: is for the world {values['world']!r}; expected {world!r}")
-    for name in values[section] if isinstance(values[section], dict) else ():
-        if gone and name in gone:
-            raise LidarFileError(f"{path}: the setting {name!r} in {section!r} is gone: {gone[name]}")
     try:
         return config_from_dict(kind, values[section])
     except ValueError as error:

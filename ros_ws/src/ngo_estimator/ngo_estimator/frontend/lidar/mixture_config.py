@@ -85,24 +85,9 @@ class MixtureConfig:
             raise ValueError(f"anything is {self.anything}; expected two deviations")
 
 
-_NOT_NEEDED = "nothing replaces it"
-_GONE = {
-    "front_end": "there is one front end; leave it out",
-    "mixture": 'its settings stand in "odometry" itself',
-    "learned_deviation": "no network scales deviations now; leave it out",
-    "odometry": '"key_m", "key_deg", "submap_scans", "icp" and the search\'s settings stand in its place',
-    "wheels": "lag, slips and freezes of wheels are learned without settings",
-    "wheel_silence_s": _NOT_NEEDED,
-    "least_share": _NOT_NEEDED,
-    "least_variance_m2": _NOT_NEEDED,
-    "least_variance_rad2": _NOT_NEEDED,
-}
-"""Settings of the front end before this one, and what replaces each."""
-
-
 def read_mixture_config(weights: Path, world: str | None = None) -> MixtureConfig:
     """The front end's settings in ``lidar.json`` of the folder ``weights``; raises ``LidarFileError`` of one line."""
-    return read_lidar_file(weights, "odometry", MixtureConfig, world, _GONE)
+    return read_lidar_file(weights, "odometry", MixtureConfig, world)
 
 
 def _positive(value: Any) -> bool:
