@@ -7,25 +7,40 @@ import numpy as np
 import pytest
 import torch
 
-from benchmarks import camera_live, drives
+from benchmarks import camera_live, drives, lidar_tf
 from benchmarks.core_speed import Watched, core_speed
 from benchmarks.drives import Drive, drive_of, episodes, stamp_ns
+from benchmarks.lidar_depth import WHEELS
 from benchmarks.lidar_live import RATE_HZ, Arguments, frames_of
 from benchmarks.long_run import stored_path_mb
 from benchmarks.peers import Incremental, LevenbergMarquardt, Problem
 from benchmarks.process_use import cpu_s, memory_mb
 from ngo_estimator.data.row_buffers import GrowingRows
 from ngo_estimator.geometry import se2
+from ngo_estimator.geometry.planar_motion import between, compose
 from ngo_estimator.nodes.messages import to_ns
 from ngo_estimator.slam.corrected_trajectory import CorrectedTrajectory
 from ngo_estimator.slam.online_trajectory import OnlineTrajectory
+from ngo_sim.building2d import Building2d
 from ngo_sim.episodes import record_episode
+from ngo_sim.floor_plans import FloorPlanConfig
+from ngo_sim.lidar import ScannerConfig
 from tests.unit.ngo_estimator import rendered_room
 from tests.unit.ngo_estimator.slam.test_online_trajectory import make_steps
 from tests.unit.ngo_estimator.slam.test_saved_state import lidar_drive, networks, scans
 from training.baselines.pose_graph import xyyaw
 from training.common.records import WEIGHTS
 from training.data.worlds import world_named
+
+
+def test_a_right_correction_has_no_error_and_one_of_another_clock_that_of_the_way() -> None:
+    drive = Building2d(FloorPlanConfig(), ScannerConfig(rays=4), WHEELS).record(12, 10_000.0, 60)
+    true, wheels = between(drive.true_poses_xyyaw[0], drive.true_poses_xyyaw[50]), drive.wheel_poses_xyyaw[50]
+    correction = compose(true, between(wheels, np.zeros(3)))
+    assert lidar_tf.error(drive, lidar_tf.BEGIN_NS + 5 * 10**9, correction, 0.0) < 1e-9
+    way_m = float(np.linalg.norm((wheels - drive.wheel_poses_xyyaw[45])[:2]))
+    off_m = lidar_tf.error(drive, lidar_tf.BEGIN_NS + 5 * 10**9, correction, 0.5)
+    assert off_m == pytest.approx(way_m) and way_m > 0.05
 
 
 def test_the_parts_of_a_drive_follow_each_other() -> None:

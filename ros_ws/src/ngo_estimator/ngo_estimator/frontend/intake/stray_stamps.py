@@ -4,20 +4,16 @@ A source that restarts goes on from where its stamps jumped to; after a stray st
 whose stamp jumps waits for the next one, which tells both apart.
 """
 
-from typing import Generic, Protocol, TypeVar
+from typing import Generic, TypeVar
 
 from ngo_estimator.data.relative_step import RESTART_AFTER_NS
+from ngo_recordings.scan_stream import LidarScan, WheelPose
 
 _FAR_NS = 60_000_000_000
 """A stamp that is so much later than the one before jumps; sensors are not so slow, but recorders pause."""
 
 
-class _Stamped(Protocol):
-    @property
-    def stamp_ns(self) -> int: ...
-
-
-Record = TypeVar("Record", bound=_Stamped)
+Record = TypeVar("Record", LidarScan, WheelPose)
 
 
 class StrayStamps(Generic[Record]):

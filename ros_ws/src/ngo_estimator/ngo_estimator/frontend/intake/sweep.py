@@ -8,8 +8,7 @@ counts as long as nothing contradicts it.
 import math
 import statistics
 from collections import deque
-from dataclasses import dataclass, replace
-from functools import cached_property
+from dataclasses import replace
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -50,17 +49,9 @@ _GATES_M = (0.4, 0.4, 0.25, 0.15, 0.15, 0.1)
 _SOURCES, _TARGETS = 160, 480
 
 
-@dataclass(frozen=True, eq=False)
-class _Taken:
-    scan: LidarScan
-    mounting: Mounting
-    pose: Array  # in odom
-    twist: Array
-
-    @cached_property
-    def seen(self) -> tuple[Array, Array, Array]:
-        """Points ``(n, 2)`` in the base frame as if the robot stood, their share of the sweep, and normals."""
-        return _seen(self.scan, self.mounting)
+_Seen = tuple[Array, Array, Array]
+_Taken = tuple[Array, Array, _Seen]
+"""Pose in odom and velocity at a scan, and what it shows."""
 
 
 class MeasuredSweep:
@@ -163,12 +154,12 @@ class MeasuredSweep:
             return
         velocity = (step if motion is None else motion) / elapsed_s
         if self._taken:  # the robot moved so before and after the scan before
-            last = self._taken.pop()
-            self._taken.append(replace(last, twist=0.5 * (last.twist + velocity)))
+            pose, twist, seen = self._taken.pop()
+            self._taken.append((pose, 0.5 * (twist + velocity), seen))
             if self._since >= every:
                 self._since = 0
-                self._measure()
-        self._taken.append(_Taken(scan, mounting, self._pose, velocity))
+                self._measure(scan)
+        self._taken.append((self._pose, velocity, _seen(scan, mounting)))
 
     def remark(self) -> str:
         """What the driver says wrongly of the sweep, in words; nothing where it is right."""
@@ -179,29 +170,30 @@ class MeasuredSweep:
             return f"its sweep lasts {abs(self.known_s):.3f} s {way}, the driver says something else: corrected"
         return f"its times from ray to ray are taken times {self.unit:g}" if self.unit != 1.0 else ""
 
-    def _measure(self) -> None:
+    def _measure(self, scan: LidarScan) -> None:
+        """The sweep by the newest one taken, like ``scan``."""
         newest, period_s = self._taken[-1], self._period_s
         best, bend = None, _LEAST_BEND_M
         for other in list(self._taken)[:-1]:
-            off = between(other.pose, newest.pose)
+            off = between(other[0], newest[0])
             if math.hypot(off[0], off[1]) > _FAR_M or abs(off[2]) > _FAR_RAD:
                 continue
-            change = np.abs(newest.twist - other.twist)
+            change = np.abs(newest[1] - other[1])
             size = period_s * (math.hypot(change[0], change[1]) + 3.0 * change[2])
             if size > bend:
                 best, bend = other, size
         if best is None:
             return
         self._tried += 1
-        start_s = abs(self._given_s(newest.scan)) or period_s
+        start_s = abs(self._given_s(scan)) or period_s
         fits = [fit for sign in (1.0, -1.0) if (fit := _fit(best, newest, sign * start_s)) is not None]
         if fits:
             cost, time_s, deviation_s = min(fits)
             if math.isfinite(cost) and abs(time_s) < 2.0 * period_s:
                 self._found.append((time_s, deviation_s))
-        self._decide()
+        self._decide(scan)
 
-    def _decide(self) -> None:
+    def _decide(self, scan: LidarScan) -> None:
         if len(self._found) < _FEWEST:
             return
         times, deviations = np.array(self._found).T
@@ -210,7 +202,6 @@ class MeasuredSweep:
         share = np.cumsum(weights[order]) / weights.sum()
         low, measured, high = np.interp((0.25, 0.5, 0.75), share, times[order])
         spread = max(0.74 * (high - low), float(1.0 / math.sqrt(weights.sum() / len(times)))) / math.sqrt(len(times))
-        scan = self._taken[-1].scan
         believed_s = self._time_s(scan)
         self._known = _DEVIATIONS * spread < _OFF * self._period_s  # more of them would decide the same
         if not self._known or abs(measured - believed_s) < _OFF * self._period_s:
@@ -226,7 +217,8 @@ class MeasuredSweep:
         self.known_s = None if abs(known_s) == abs(given_s) else known_s
 
 
-def _seen(scan: LidarScan, mounting: Mounting) -> tuple[Array, Array, Array]:
+def _seen(scan: LidarScan, mounting: Mounting) -> _Seen:
+    """Points ``(n, 2)`` in the base frame as if the robot stood, their share of the sweep, and normals."""
     angles, ranges = scan.angles, scan.ranges.astype(np.float64)
     largest = scan.range_max if 0.0 < scan.range_max < math.inf else 1000.0
     seen = np.flatnonzero((ranges > max(scan.range_min, 0.0)) & (ranges < largest))
@@ -248,16 +240,16 @@ def _seen(scan: LidarScan, mounting: Mounting) -> tuple[Array, Array, Array]:
 
 def _fit(first: _Taken, second: _Taken, time_s: float) -> tuple[float, float, float] | None:
     """Mean cost of the registration, the time of the sweep (s) and its deviation, from a first guess of it."""
-    (target, target_share, normal), (source, source_share, _) = first.seen, second.seen
+    (begin, first_twist, (target, target_share, normal)), (end, second_twist, (source, source_share, _)) = first, second
     on_line = np.flatnonzero(normal.any(axis=1))
     on_line = on_line[:: max(1, len(on_line) // _TARGETS)]
     chosen = np.arange(0, len(source), max(1, len(source) // _SOURCES))
     if len(on_line) < 30 or len(chosen) < 30:
         return None
     target, normal, source = target[on_line], normal[on_line], source[chosen]
-    target_rate = target_share[on_line, None] * _velocities(first.twist, target)
-    source_rate = source_share[chosen, None] * _velocities(second.twist, source)
-    pose, cost, information, noise = between(first.pose, second.pose), math.inf, 0.0, 1.0
+    target_rate = target_share[on_line, None] * _velocities(first_twist, target)
+    source_rate = source_share[chosen, None] * _velocities(second_twist, source)
+    pose, cost, information, noise = between(begin, end), math.inf, 0.0, 1.0
     for gate in _GATES_M:
         there, here = target + time_s * target_rate, source + time_s * source_rate
         moved = transformed(pose, here)
