@@ -35,7 +35,7 @@ def seen(pose: np.ndarray, points: np.ndarray, looks: np.ndarray, rough: float) 
     std_rad = np.where(np.arange(len(rays)) % 2, 2e-3, 2e-3 + rough)
     rays[::2, :2] = se2.rotate(np.asarray(rough), rays[::2, :2])
     ahead = rays[:, 0] > 0.7
-    return KeyPicture(CENTRE, rays[ahead], std_rad[ahead], looks[ahead])
+    return KeyPicture.of(CENTRE, rays[ahead], std_rad[ahead], looks[ahead])
 
 
 def place() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -120,6 +120,15 @@ def test_as_many_deviations_off_a_loop_is_taken_where_the_graph_knows_more(std_r
 def test_only_loops_that_are_believed_make_the_graph_surer() -> None:
     refused, believed = (driven(PictureLoopConfig(), 0.002, 0.01, belief=belief)[0].loops for belief in (0.0, 1.0))
     assert 0 < len(believed) < len(refused)  # what contradicts the believed ones is not taken
+
+
+def test_a_key_picture_keeps_what_features_look_like_in_a_byte_each() -> None:
+    points, looks, truth = place()
+    picture = seen(truth[0], points, looks, 0.0)
+    again = KeyPicture.unpacked(picture.packed())
+    np.testing.assert_array_equal(again.looks, picture.looks)
+    whole = KeyPicture.of(CENTRE, points, np.ones(len(points)), looks)
+    assert whole.looks.nbytes == looks.size and np.linalg.norm(whole.descriptors - looks, axis=1).max() < 0.02
 
 
 def test_old_pictures_are_let_go() -> None:

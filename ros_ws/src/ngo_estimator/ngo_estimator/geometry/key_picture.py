@@ -14,6 +14,7 @@ LAYOUT = 2
 
 _LENGTHS = (8, 512)
 _HEADER = 4
+_MOST = 127.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -24,20 +25,33 @@ class KeyPicture:
         centre: of the camera in the robot's base frame ``(3,)``, m.
         rays: unit vectors ``(n, 3)`` to the features, in base axes.
         std_rad: deviations ``(n,)`` of the rays.
-        descriptors: ``(n, d)`` float32 unit vectors: the nearer two are, the more alike the features.
+        looks: directions ``(n, d)`` of the descriptors as int8, a quarter of their memory.
     """
 
     centre: Array
     rays: Array
     std_rad: Array
-    descriptors: np.ndarray
+    looks: np.ndarray
+
+    @classmethod
+    def of(cls, centre: Array, rays: Array, std_rad: Array, descriptors: np.ndarray) -> "KeyPicture":
+        """The picture with these ``descriptors`` ``(n, d)``, of which the direction counts."""
+        largest = np.abs(descriptors).max(axis=1, keepdims=True, initial=1e-9)
+        return cls(centre, rays, std_rad, np.rint(_MOST / largest * descriptors).astype(np.int8))
+
+    @property
+    def descriptors(self) -> np.ndarray:
+        """Unit vectors ``(n, d)`` float32: the nearer two are, the more alike the features."""
+        looks = self.looks.astype(np.float32)
+        unit: np.ndarray = looks / np.maximum(np.linalg.norm(looks, axis=1, keepdims=True), 1.0)
+        return unit
 
     def __len__(self) -> int:
         return len(self.rays)
 
     def packed(self) -> np.ndarray:
         """All of it in one vector ``(4 + n (4 + d),)``, as the place code of a step carries it."""
-        head = (self.descriptors.shape[1], *self.centre)
+        head = (self.looks.shape[1], *self.centre)
         rows = np.concatenate((self.rays, self.std_rad[:, None], self.descriptors), axis=1)
         return np.concatenate((head, rows.ravel())).astype(np.float32)
 
@@ -58,12 +72,12 @@ class KeyPicture:
         sizes = np.concatenate((np.linalg.norm(rays, axis=1), np.linalg.norm(descriptors, axis=1)))
         if (np.abs(sizes - 1.0) > 0.01).any():
             raise ValueError("place_code has rays or descriptors that are not unit vectors")
-        return cls(code[1:4].astype(np.float64), rays, std_rad, descriptors.copy())
+        return cls.of(code[1:4].astype(np.float64), rays, std_rad, descriptors)
 
 
 def nothing_seen() -> KeyPicture:
     """A picture without features: it stands for one that is not known."""
-    return KeyPicture(np.zeros(3), np.zeros((0, 3)), np.zeros(0), np.zeros((0, _LENGTHS[0]), np.float32))
+    return KeyPicture(np.zeros(3), np.zeros((0, 3)), np.zeros(0), np.zeros((0, _LENGTHS[0]), np.int8))
 
 
 def matches(first: KeyPicture, second: KeyPicture, ratio: float) -> np.ndarray:
@@ -72,7 +86,7 @@ def matches(first: KeyPicture, second: KeyPicture, ratio: float) -> np.ndarray:
     Args:
         ratio: the second best must be so many times as far away (Lowe 2004).
     """
-    if min(len(first), len(second)) < 2 or first.descriptors.shape[1] != second.descriptors.shape[1]:
+    if min(len(first), len(second)) < 2 or first.looks.shape[1] != second.looks.shape[1]:
         return np.zeros((0, 2), np.int64)
     alike = first.descriptors @ second.descriptors.T
     best, back = alike.argmax(1), alike.argmax(0)

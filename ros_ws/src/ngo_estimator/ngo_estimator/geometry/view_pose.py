@@ -97,7 +97,7 @@ def base_vectors(points: RangedRays, pose: Array, centre: Array) -> Array:
 def unmeasured(origin: Array, rays: Array, inverse: float) -> RangedRays:
     """Points along rays ``(n, 3)`` from one origin ``(3,)``, whose ranges nobody knows."""
     count = len(rays)
-    return RangedRays(np.tile(origin, (count, 1)), rays, np.full(count, inverse), np.full(count, UNKNOWN_STD))
+    return RangedRays(np.broadcast_to(origin, (count, 3)), rays, np.full(count, inverse), np.full(count, UNKNOWN_STD))
 
 
 def ray_errors(points: RangedRays, seen: Array, pose: Array, centre: Array) -> tuple[Array, Array, Array]:

@@ -58,9 +58,10 @@ class PicturePlaces:
     def _vector(self, picture: KeyPicture) -> np.ndarray:
         words = self._words
         summed = np.zeros_like(words)
-        if picture.descriptors.shape[1] == words.shape[1] and len(picture):
-            nearest = (picture.descriptors @ words.T - 0.5 * (words**2).sum(1)).argmax(1)
-            np.add.at(summed, nearest, picture.descriptors - words[nearest])
+        descriptors = picture.descriptors
+        if descriptors.shape[1] == words.shape[1] and len(picture):
+            nearest = (descriptors @ words.T - 0.5 * (words**2).sum(1)).argmax(1)
+            np.add.at(summed, nearest, descriptors - words[nearest])
             summed /= np.maximum(np.linalg.norm(summed, axis=1, keepdims=True), 1e-9)
         vector = summed.ravel()
         shorter: np.ndarray = vector / max(float(np.linalg.norm(vector)), 1e-9)

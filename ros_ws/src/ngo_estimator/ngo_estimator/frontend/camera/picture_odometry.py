@@ -186,7 +186,7 @@ class PictureOdometry:
         self._key_pose = self._odometry.pose.copy()
         pixels, std, descriptors = (found[: self._config.features] for found in self._describer.describe(grey))
         rays, std_rad = self.model.rays(pixels), std * self.model.pixel_rad
-        return KeyPicture(self.model.centre, rays, std_rad, descriptors).packed()
+        return KeyPicture.of(self.model.centre, rays, std_rad, descriptors).packed()
 
 
 def _grey(picture: np.ndarray) -> Grey:
