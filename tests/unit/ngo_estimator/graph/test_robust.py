@@ -166,6 +166,14 @@ def test_errors_in_common_do_not_shut_out_the_loops_of_another_place(least_scale
     assert (weights[later > 170] > 0.5).all() == believed and (weights[later <= 170] > 0.5).all()
 
 
+def test_right_loops_are_believed_where_the_steps_alone_are_better_than_stated() -> None:
+    """One scale for both, found in cycles that are mostly steps, would make a tenth of the loops' variances, too."""
+    problem, _ = square(6, seed=3)
+    solution = Robust().correct(replace(problem, steps=problem.steps.scaled(30.0)))
+    assert (solution.loop_weights > 0.0).mean() > 0.95
+    assert solution.step_scale < 0.1 and solution.loop_scale == 1.0
+
+
 @pytest.mark.parametrize("metric", [True, False])
 def test_a_wrong_loop_that_is_written_often_is_one_witness(metric: bool) -> None:
     problem, true = square(4, seed=5, metric=metric)

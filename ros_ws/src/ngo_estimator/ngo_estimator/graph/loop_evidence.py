@@ -53,14 +53,18 @@ def likelihood_ratio(
 
 
 def scale_and_inlier_ratio(chain: ChainUncertainty, loops: RelativePoses, area: float) -> tuple[float, float]:
-    """How many times as large as stated variances are, and the inlier ratio of loops, by cycles with the chain alone.
-
-    The likeliest mixture of right and wrong loops. Both are 1 and a half where there are few loops.
-    """
+    """How many times as large as stated variances are, and the inlier ratio of loops, by cycles with the chain."""
     squared, logs = chain.off_chain(loops)
     # A chain that says no more than "on the map", as behind a step that nobody measured, measures no scale.
     informative = likelihood_ratio(np.zeros(len(loops)), logs, loops.degrees, area) > _INFORMATIVE
-    squared, logs, degrees = squared[informative], logs[informative], loops.degrees[informative]
+    return likeliest_mixture(squared[informative], logs[informative], loops.degrees[informative], area)
+
+
+def likeliest_mixture(squared: np.ndarray, logs: np.ndarray, degrees: np.ndarray, area: float) -> tuple[float, float]:
+    """The scale of the variances and the inlier ratio of right and wrong loops; arguments as of ``likelihood_ratio``.
+
+    They are 1 and a half where there are few loops.
+    """
     if len(squared) < _FEW:
         return 1.0, 0.5
     best = (-math.inf, 1.0, 0.5)

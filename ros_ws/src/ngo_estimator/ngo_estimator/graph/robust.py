@@ -7,6 +7,7 @@ Cycles of loops that know the whole relative pose measure the scale before anyth
 what is believed measure it afterwards.
 """
 
+import math
 from dataclasses import replace
 
 import numpy as np
@@ -22,7 +23,7 @@ from ngo_estimator.graph.corrector import (
 )
 from ngo_estimator.graph.cycle_agreement import ChainUncertainty, chain_poses
 from ngo_estimator.graph.graduated import graduate
-from ngo_estimator.graph.loop_evidence import cycle_odds, map_area, scale_and_inlier_ratio
+from ngo_estimator.graph.loop_evidence import cycle_odds, likeliest_mixture, map_area, scale_and_inlier_ratio
 from ngo_estimator.graph.normal_equations import GraphStructure
 from ngo_estimator.graph.relative_poses import RelativePoses
 from ngo_estimator.graph.surest_first import believe
@@ -85,7 +86,8 @@ class Robust:
             chain = chain_poses(problem.steps.relative, problem.poses[0])
             return CorrectedGraph(problem, chain, np.zeros(0), np.ones(len(problem.steps)), 0.0)
         if start is None or len(start.loop_weights) == 0:
-            return _from_nothing(problem, self._report, self._least_scale)
+            solution = _from_nothing(problem, self._report, self._least_scale)
+            return _with_wider_loops(problem, solution, self._least_scale)
         warm = _warm(problem, start, self._report, self._least_scale)
         if loops < _GROWN * start.loops_from_nothing:
             return warm
@@ -137,6 +139,23 @@ def _from_nothing(problem: GraphProblem, report: Progress, least_scale: float) -
     if scale not in (1.0, solution.loop_scale):
         solution = _polished(problem, solution.poses, solution.loop_scale, len(problem.loops), least_scale)
     return solution
+
+
+def _with_wider_loops(problem: GraphProblem, solution: CorrectedGraph, least_scale: float) -> CorrectedGraph:
+    """The solution where whole loops have larger variances than one scale for steps and loops gives them.
+
+    Residuals do not say that they are smaller: poses bend to loops.
+    """
+    metric = problem.loops.degrees == 3
+    loops, area = problem.loops[metric], map_area(problem.poses)
+    logs = -2.0 * np.log(np.abs(np.linalg.det(loops.root)))
+    wider = likeliest_mixture(loops.squared(solution.poses), logs, loops.degrees, area)[0] / solution.scale
+    if wider <= _MISSTATED:
+        return solution
+    root = np.where(metric[:, None, None], 1.0 / math.sqrt(wider), 1.0) * problem.loops.root
+    apart = replace(problem, loops=replace(problem.loops, root=root))
+    other = _polished(apart, solution.poses, solution.scale, len(problem.loops), least_scale)
+    return replace(other, problem=problem, loop_scale=_noticed(wider * other.loop_scale, least_scale))
 
 
 def _second_look(
