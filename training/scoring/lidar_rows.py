@@ -286,9 +286,11 @@ ROWS: dict[str, Row] = {
 """By name. Those that end with ``percent_wrong`` get wrong loops, so many of all."""
 
 _FRONT_ABLATION: dict[str, dict[str, Any]] = {
-    "last_displacement": {"first_weights": (0.65, 0.0, 0.25, 0.07, 0.03)},
-    "last_velocity": {"first_weights": (0.65, 0.25, 0.0, 0.07, 0.03)},
-    "no_motion": {"first_weights": (0.65, 0.14, 0.18, 0.0, 0.03)},
+    "wheels_that_are_good": {"first_weights": (0.0, 0.65, 0.1, 0.15, 0.07, 0.03)},
+    "wheels_that_are_poor": {"first_weights": (0.65, 0.0, 0.1, 0.15, 0.07, 0.03)},
+    "last_displacement": {"first_weights": (0.45, 0.2, 0.0, 0.25, 0.07, 0.03)},
+    "last_velocity": {"first_weights": (0.45, 0.2, 0.25, 0.0, 0.07, 0.03)},
+    "no_motion": {"first_weights": (0.45, 0.2, 0.14, 0.18, 0.0, 0.03)},
     "learned_deviations": {"learn_rate": 1e-9},
     "calibrated_wheels": {"certain_m": 1e9, "certain_rad": 1e9},
     "repeated_errors": {"repeated": 1.0},

@@ -121,7 +121,8 @@ class ScoreField:
         """Mean score (0 to 1) of points ``(n, 2)`` whose frame has the pose ``(3,)``; unknown without a point."""
         if not len(points):
             return self.config.unknown
-        return float(self.scores(points, pose[None], self.config.unknown)[0])
+        unknown = round(255 * self.config.unknown)
+        return float(_score(self.levels[0], points, pose, self.corner, self.config.cell_m, unknown))
 
     def scores(self, points: Array, poses: Array, unknown: float) -> Array:
         """Mean scores ``(m,)`` of at least one point ``(n, 2)`` at each of the poses ``(m, 3)``, where what was never
@@ -255,6 +256,12 @@ def _seen_at(field: Field, points: Array, pose: Array, corner: Array, cell: floa
         else:
             total += value
     return total, unseen
+
+
+@njit(cache=True)
+def _score(field: Field, points: Array, pose: Array, corner: Array, cell: float, unknown: int) -> float:
+    total, unseen = _seen_at(field, points, pose, corner, cell, unknown)
+    return (total + unseen * unknown) / (255.0 * len(points))
 
 
 @njit(cache=True)

@@ -63,7 +63,7 @@ def off(steps: list[RelativeStep], poses: np.ndarray) -> float:
     return math.hypot(last[0], last[1]) + abs(last[2])
 
 
-@pytest.mark.parametrize("weights", [(0.65, 0.0, 0.0, 0.0, 0.03), (0.0, 0.0, 0.0, 0.0, 1.0)])
+@pytest.mark.parametrize("weights", [(0.45, 0.2, 0.0, 0.0, 0.0, 0.03), (0.0, 0.0, 0.0, 0.0, 0.0, 1.0)])
 def test_where_anything_alone_is_left_it_is_searched(weights: tuple[float, ...]) -> None:
     poses = way(20)
     steps = fed(records(poses, wheels=False), MixtureLidar(MixtureConfig(first_weights=weights)))

@@ -15,11 +15,11 @@ from ngo_estimator.geometry.score_field import ScoreFieldConfig
 class MixtureConfig:
     """Settings of the front end; see the comment of each."""
 
-    # Hypotheses of a motion: wheels, the last displacement, the last velocity, none, anything. One of the weight 0, but
-    # not anything, is left out.
-    first_weights: tuple[float, ...] = (0.65, 0.1, 0.15, 0.07, 0.03)
-    first_factors: tuple[float, ...] = (1.0, 3.0, 2.0, 3.0, 1.0)  # on the deviations below
-    least_factors: tuple[float, ...] = (0.1, 0.5, 0.3, 0.5, 1.0)
+    # Hypotheses of a motion: wheels that are good, wheels that are poor, the last displacement, the last velocity,
+    # none, anything. One of the weight 0, but not anything, is left out.
+    first_weights: tuple[float, ...] = (0.45, 0.2, 0.1, 0.15, 0.07, 0.03)
+    first_factors: tuple[float, ...] = (0.5, 2.0, 3.0, 2.0, 3.0, 1.0)  # on the deviations below
+    least_factors: tuple[float, ...] = (0.1, 1.0, 0.5, 0.3, 0.5, 1.0)
     most_factor: float = 6.0
     least_weight: float = 0.01
     still_m: float = 0.01  # deviation of a motion's position where there is none; it grows with way and turn
@@ -79,8 +79,10 @@ class MixtureConfig:
             may_be_zero = name == "first_weights" and value[-1] > 0.0 and all(0.0 <= each < math.inf for each in value)
             if not (may_be_zero or _positive(value)):
                 raise ValueError(f"{name} is {value}; expected positive numbers")
-        if not all(len(each) == 5 for each in (self.first_weights, self.first_factors, self.least_factors)):
-            raise ValueError("first_weights, first_factors, least_factors: expected a number for each of 5 hypotheses")
+        if not all(len(each) == 6 for each in (self.first_weights, self.first_factors, self.least_factors)):
+            raise ValueError(
+                "first_weights, first_factors, least_factors: expected one number for each of 6 hypotheses"
+            )
         if len(self.anything) != 2:
             raise ValueError(f"anything is {self.anything}; expected two deviations")
 

@@ -25,18 +25,19 @@ from ngo_estimator.geometry.planar_motion import (
     wrap,
 )
 
-WHEELS, LAST, VELOCITY, NONE, ANY = range(5)
+TIGHT, LOOSE, LAST, VELOCITY, NONE, ANY = range(6)
 
 _KNOWN = np.zeros((3, 3))
 """Covariance of what is measured exactly."""
 
 
 class MotionMixture:
-    """Hypotheses: wheels, the last displacement, the last velocity, none, anything.
+    """Hypotheses: wheels that are good, wheels that are poor, the last displacement, the last velocity, none,
+    anything.
 
     Attributes:
-        weights: of the hypotheses ``(5,)``, as learned.
-        steps, deviations: mean motions ``(5, 3)`` as foretold last, and their deviations ``(5, 2)`` (m, rad).
+        weights: of the hypotheses ``(6,)``, as learned.
+        steps, deviations: mean motions ``(6, 3)`` as foretold last, and their deviations ``(6, 2)`` (m, rad).
         calibration: expected motions are those that the wheels count ``(3,)`` times this ``(3, 3)``, by running least
             squares: scales of way and turn, yaw of the scanner against its mounting, lever arm between both.
         filter: of pose and velocity.
@@ -47,9 +48,9 @@ class MotionMixture:
         self.weights = np.array(config.first_weights)
         self._factors = np.array(config.first_factors)[:, None].repeat(2, axis=1)  # of positions, of headings
         self._squares, self._least = self._factors**2, np.array(config.least_factors)
-        self.steps = np.zeros((5, 3))
-        self._usable = np.zeros(5, np.bool_)
-        self._base = self.deviations = np.ones((5, 2))
+        self.steps = np.zeros((6, 3))
+        self._usable = np.zeros(6, np.bool_)
+        self._base = self.deviations = np.ones((6, 2))
         self._gap = self._last_gap = 1.0
         self._yaw = 0.0
         self.filter = VelocityFilter()
@@ -70,14 +71,14 @@ class MotionMixture:
         ``gap`` is the time since the last scan in usual periods: what the wheels did not count is as much longer.
         """
         heard = by_wheels is not None
-        self._usable[:] = (self.weights > 0.0) & np.array((heard, True, True, True, True))
+        self._usable[:] = (self.weights > 0.0) & np.array((heard, heard, True, True, True, True))
         self.steps[:] = 0.0
         self._last_gap, self._gap = self._gap, min(max(gap, 0.05), self._config.most_gap)
         self.steps[LAST] = self.steps[ANY] = arc_motion(self.filter.velocity, self._last_gap)
         self.steps[VELOCITY] = arc_motion(self.filter.velocity, self._gap)
         self._counted = counted
         if by_wheels is not None:
-            self.steps[WHEELS] = self.steps[ANY] = by_wheels
+            self.steps[TIGHT] = self.steps[LOOSE] = self.steps[ANY] = by_wheels
         c = self._config
         grow = c.still_m, c.way_share, c.turn_m, math.radians(c.still_deg), c.turn_share, c.way_rad
         self._base, self.deviations = _grown(self.steps, self._factors, max(self._gap, 1.0), grow, c.anything)
@@ -107,7 +108,7 @@ class MotionMixture:
     @property
     def trusts_wheels(self) -> bool:
         """Whether wheels are the heaviest: without them nothing but the scan tells how far the robot went."""
-        return self.heaviest == WHEELS
+        return self.heaviest in (TIGHT, LOOSE)
 
     def likeliest(self, pose: Array, mixture: Mixture) -> int:
         """The hypothesis that is likeliest at a pose ``(3,)`` under the ``mixture`` as walls measure it.
@@ -123,7 +124,7 @@ class MotionMixture:
 
     def expected(self, hypothesis: int, pose: Array, covariance: Array) -> tuple[Array, Array]:
         """The pose ``(3,)`` that a hypothesis foretells after ``pose`` of ``covariance``, and its covariance."""
-        repeated = self._config.repeated if hypothesis == WHEELS else 1.0
+        repeated = self._config.repeated if hypothesis in (TIGHT, LOOSE) else 1.0
         mean, spread = _expected(pose, covariance, self.steps[hypothesis], self.deviations[hypothesis], repeated)
         if hypothesis in (LAST, VELOCITY):
             spread = self._foretold[hypothesis][0][:3, :3].copy()
@@ -131,7 +132,7 @@ class MotionMixture:
 
     def step_covariance(self, hypothesis: int) -> Array:
         """Covariance ``(3, 3)`` of a hypothesis' motion; errors of wheels repeat from step to step."""
-        repeated = self._config.repeated if hypothesis == WHEELS else 1.0
+        repeated = self._config.repeated if hypothesis in (TIGHT, LOOSE) else 1.0
         result: Array = _diagonal(self.deviations[hypothesis], repeated)
         return result
 
@@ -192,10 +193,10 @@ def _grown(
     steps: Array, factors: Array, longer: float, grow: tuple[float, float, float, float, float, float],
     anything: tuple[float, float],
 ) -> tuple[Array, Array]:  # fmt: skip
-    """Deviations ``(5, 2)`` (m, rad) of steps ``(5, 3)``, before factors and with them."""
+    """Deviations ``(6, 2)`` (m, rad) of steps ``(6, 3)``, before factors and with them."""
     still_m, way_share, turn_m, still_rad, turn_share, way_rad = grow
-    base = np.empty((5, 2))
-    for k in range(5):
+    base = np.empty((6, 2))
+    for k in range(6):
         way = math.hypot(steps[k, 0], steps[k, 1]) if k not in (NONE, ANY) else 0.0
         turn = abs(steps[k, 2]) if k not in (NONE, ANY) else 0.0
         base[k, 0] = still_m + way_share * way + turn_m * turn
@@ -229,29 +230,29 @@ def _learned(
     factors: Array, least: Array, step: Array, walls: Array, joint: Array, gaps: tuple[float, float],
     numbers: tuple[float, float, float, float],
 ) -> tuple[float, float]:  # fmt: skip
-    """Move weights ``(5,)``, ``squares`` and ``factors`` ``(5, 2)`` by a match; the wheels' share in it, and the way.
+    """Move weights ``(6,)``, ``squares`` and ``factors`` ``(6, 2)`` by a match; the wheels' share in it, and the way.
 
     ``joint`` ``(6, 6)`` is what the last match left open.
     """
     learn_rate, learn_way, least_weight, most_factor = numbers
-    by_wheels = steps[WHEELS] if usable[WHEELS] else step
+    by_wheels = steps[TIGHT] if usable[TIGHT] else step
     way = max(math.hypot(step[0], step[1]), math.hypot(by_wheels[0], by_wheels[1]))
     rate = learn_rate * min(1.0, way / learn_way + max(abs(step[2]), abs(by_wheels[2])) / learn_way)
     if rate <= 0.0:
         return 0.0, way
-    variance = np.empty((5, 2))
+    variance = np.empty((6, 2))
     variance[:, 0], variance[:, 1] = 0.5 * (walls[0, 0] + walls[1, 1]), walls[2, 2]
     for k, periods in ((LAST, gaps[0]), (VELOCITY, gaps[1])):
         variance[k, 0] += 0.5 * (joint[3, 3] + joint[4, 4]) * periods**2
         variance[k, 1] += joint[5, 5] * periods**2
     errors, shares = _shared(steps, step, deviations, variance, weights, usable)
     held = (weights * usable).sum()
-    for k in range(5):
+    for k in range(6):
         if usable[k]:
             weights[k] += rate * (held * shares[k] - weights[k])
     weights[:] = np.where(weights > 0.0, np.maximum(weights, least_weight), 0.0)
     weights /= weights.sum()
-    for k in range(5):
+    for k in range(6):
         for i in range(2):
             # Of a posterior: what the match leaves open is as likely as it was foretold.
             known = deviations[k, i] ** 2
@@ -259,7 +260,7 @@ def _learned(
             shrunk = errors[k, i] * part**2 + part * variance[k, i]
             squares[k, i] += rate * shares[k] * (min(shrunk / base[k, i] ** 2, most_factor**2) - squares[k, i])
             factors[k, i] = min(max(math.sqrt(squares[k, i]), least[k]), most_factor)
-    return shares[WHEELS], way
+    return shares[TIGHT] + shares[LOOSE], way
 
 
 @njit(cache=True)
