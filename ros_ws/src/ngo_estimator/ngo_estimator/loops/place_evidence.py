@@ -26,7 +26,7 @@ _WALL_POINTS = 4
 STRETCH_M, _PART = 20.0, 4
 """The way that is compared at most, and of how many key scans a part of it is."""
 
-_NEAR_M, MOST_SCANS = 8.0, 60
+NEAR_M, MOST_SCANS = 8.0, 60
 """The key scans that it is compared with: how far from it, and how many at most."""
 
 _MOST_POINTS = 2000
@@ -189,7 +189,7 @@ def _near(poses: np.ndarray, stretch: np.ndarray) -> np.ndarray:
     for k in range(len(poses)):
         for i in range(len(stretch)):
             x, y = poses[k, 0] - stretch[i, 0], poses[k, 1] - stretch[i, 1]
-            if x * x + y * y < _NEAR_M * _NEAR_M:
+            if x * x + y * y < NEAR_M * NEAR_M:
                 result[k] = True
                 break
     return result

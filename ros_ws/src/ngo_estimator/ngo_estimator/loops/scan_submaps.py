@@ -25,8 +25,8 @@ _PLACED_ROWS = {"points": (2,), "normals": (2,), "sensors": (3,), "profiles": (P
 
 @dataclass(frozen=True)
 class Submap:
-    """Scans around a key, in its frame: ``poses`` of the keys from ``first`` on, as they were when it was made. Without
-    any point there is no grid."""
+    """Scans around a key, in its frame: ``poses`` of its keys as they were when it was made; the lowest is ``first``.
+    Those of the search for loops follow each other. Without any point there is no grid."""
 
     first: int
     poses: np.ndarray
@@ -65,7 +65,7 @@ class ScanSubmaps:
         return submap
 
     def renumber(self, number: np.ndarray) -> None:
-        """Take that each key scan has another number ``(keys,)`` now; those of a submap follow each other as before."""
+        """Take that each key scan has another number ``(keys,)`` now, where those of a submap follow each other."""
         self._submaps = OrderedDict(
             (int(number[place]), replace(submap, first=int(number[submap.first])))
             for place, submap in self._submaps.items()

@@ -288,7 +288,8 @@ class ScanBackEnd(BackEnd):
     def matcher(self, origin: MapOrigin) -> ScanMatcher:
         """Compares scans with the key scans as they are; they lie in ``map`` as ``origin`` says."""
         poses = origin.poses(self.graph.poses.copy())
-        return ScanMatcher(self._scans[:], poses, self._finder.views, self.config.loops)
+        parts, _ = self.places(np.arange(len(self.graph)))
+        return ScanMatcher(self._scans[:], poses, self._finder.views, self.config.loops, parts=parts)
 
     def localiser(self, origin: MapOrigin) -> Localiser:
         """Localises in the key scans as they are; raises ``ValueError`` where none has a point."""

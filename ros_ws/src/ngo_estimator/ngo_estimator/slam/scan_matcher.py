@@ -18,6 +18,7 @@ from ngo_estimator.geometry.planar_motion import between, compose, transformed, 
 from ngo_estimator.loops.key_scan_views import KeyScanViews
 from ngo_estimator.loops.place_evidence import (
     MOST_SCANS,
+    NEAR_M,
     STRETCH_M,
     PlaceEvidence,
     evidence_at,
@@ -57,6 +58,8 @@ class ScanMatcher:
         views: of these scans, or of the first of them.
         config: how a loop is searched and tested.
         reach_m: how far the robot is from one of the map's key scans at most. Anywhere, infinity, costs ten times more.
+        parts: the part of the map that each key scan is in ``(keys,)``. Of a drive few may be left: those of one part
+            that are around a place show it together. By default the map is one way.
     """
 
     place_m = 1.0
@@ -70,12 +73,13 @@ class ScanMatcher:
         views: KeyScanViews,
         config: ScanLoopConfig,
         reach_m: float = math.inf,
+        parts: np.ndarray | None = None,
     ) -> None:
         points = [transformed(pose, scan.points) for pose, scan in zip(poses, scans, strict=True)]
         if sum(map(len, points)) == 0:
             raise ValueError("no key scan of the map has a point; expected a map with walls")
         self._scans, self._poses, self._views = scans, poses, views.of_map(scans)
-        self._config = config
+        self._config, self._parts = config, parts
         self._submaps = ScanSubmaps(config)
         self._ambiguous: dict[tuple[int, float], bool] = {}
         together = np.concatenate(points)
@@ -211,9 +215,10 @@ class ScanMatcher:
         """
         place = int(self._views.most_alike(self._poses, source.points, expected)[0])
         there = around_in_time(place, len(self._scans), self._config.submap_keys)
-        if self._near is None:  # a saved map: of one of its drives few key scans may be left, but all are laid together
+        if self._parts is not None:
             alike = self._views.most_alike(self._poses, self._scans[place].points, self._poses[place])
-            there = np.sort(alike[:MOST_SCANS])
+            near = np.linalg.norm(self._poses[alike, :2] - self._poses[place, :2], axis=1) < NEAR_M
+            there = np.sort(alike[near & (self._parts[alike] == self._parts[place])][:MOST_SCANS])
         submap = self._submaps.around(place, there, self._scans, self._views.profiles, self._poses)
         found = fit(self._config, submap, source, between(self._poses[place], expected), _AROUND)
         if found is None:
