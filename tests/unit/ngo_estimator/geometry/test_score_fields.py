@@ -37,7 +37,7 @@ def mixture(seed: int) -> Mixture:
 def test_the_best_mode_is_that_of_all_poses(seed: int) -> None:
     field, points, prior = seen(walls(seed)), walls(seed + 100)[::3], mixture(seed)
     window = np.array((0.1, -0.05, 0.2)), (0.6, math.radians(12.0)), math.radians(2.0)
-    best, total = two_modes(field, points, *window, prior, 0.04, (0.3, 0.1), 3.0)[0]
+    best, total = two_modes(field, points, *window, prior=prior, weight=0.04, apart=(0.3, 0.1), margin=3.0)[0]
     cell = CONFIG.cell_m
     totals = {}
     padded = np.pad(field.levels[0], 100, constant_values=round(255 * CONFIG.unknown))
@@ -60,7 +60,7 @@ def test_two_places_that_look_alike_are_both_found() -> None:
     posts = np.stack((np.arange(-3.0, 3.1, 0.5), np.full(13, 1.0)), -1)
     flat = Mixture(np.zeros((1, 3)), np.full((1, 2), 2.0), np.zeros(1))
     window = np.zeros(3), (0.7, 0.05), 0.02
-    modes = two_modes(seen(posts), posts, *window, flat, 0.04, (0.3, 0.1), 0.2)
+    modes = two_modes(seen(posts), posts, *window, prior=flat, weight=0.04, apart=(0.3, 0.1), margin=0.2)
     assert len(modes) == 2
     np.testing.assert_allclose(modes[0][0], 0.0, atol=0.04)
     assert abs(abs(modes[1][0][0]) - 0.5) < 0.07 and modes[1][1] < modes[0][1]

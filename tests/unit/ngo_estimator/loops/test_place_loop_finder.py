@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import torch
 
+from ngo_estimator.data.relative_step import RelativeStep
 from ngo_estimator.data.state_arrays import restore, state_of
 from ngo_estimator.geometry import se2
 from ngo_estimator.geometry.key_picture import KeyPicture
@@ -14,10 +15,12 @@ from ngo_estimator.graph.key_frames import KeyFrame, KeyFrames
 from ngo_estimator.graph.pose_graph import PoseGraph
 from ngo_estimator.loops.loop_closure import LoopSearch
 from ngo_estimator.loops.pair_measurement import PairMeasurement
+from ngo_estimator.loops.picture_fit import PictureFit
 from ngo_estimator.loops.picture_loop_finder import PictureLoopFinder
-from ngo_estimator.loops.picture_settings import PictureLoopConfig
+from ngo_estimator.loops.picture_settings import PictureGraphConfig, PictureLoopConfig
 from ngo_estimator.loops.place_loop_finder import PlaceLoopFinder
 from ngo_estimator.loops.place_loops import PlaceLoops
+from ngo_estimator.slam.picture_back_end import PictureBackEnd
 from tests.unit.ngo_estimator.samples import small_pair_head
 
 CENTRE = np.array((0.2, 0.0, 0.8))
@@ -122,13 +125,38 @@ def test_only_loops_that_are_believed_make_the_graph_surer() -> None:
     assert 0 < len(believed) < len(refused)  # what contradicts the believed ones is not taken
 
 
+def test_loops_that_wait_for_an_optimisation_make_the_graph_no_surer() -> None:
+    points, looks, truth = place()
+    back_end, nothing, covariance = PictureBackEnd(PictureGraphConfig()), np.zeros(0), np.diag((1e-4, 1e-4, 1e-4))
+    codes = [seen(pose, points, looks, 0.0).packed() for pose in truth]
+    for k, relative in enumerate(se2.between(truth[:-1], truth[1:]) + (0.0, 0.0, 0.002)):
+        step = RelativeStep(
+            k + 1, k, relative, covariance, 0, relative, nothing, codes[k + 1], from_place_code=codes[0]
+        )
+        if k == 0:
+            back_end.begin_at(step)
+        back_end.append(step)
+        back_end.work(optimize=False)
+    unsure, _ = driven(PictureLoopConfig(), 0.002, 0.01, belief=0.0)
+    assert back_end.waiting_loops == pytest.approx(len(unsure.loops), abs=2)
+
+
+def test_where_a_sure_graph_does_not_expect_it_there_is_no_loop_on_a_large_map_either() -> None:
+    finder = PictureLoopFinder(PictureLoopConfig())
+    poses = np.array(((0.0, 0.0, 0.0), (3.0, 0.0, 0.0), (60.0, 60.0, 0.0)))
+    for deviations, expected in ((3.0, True), (5.0, False)):
+        off = np.array((3.0 + 0.03 * deviations, 0.0, 0.0))
+        fitted = PictureFit(off, np.diag((0.03**2, 0.03**2, 0.006**2)), 40)
+        assert finder._expected(fitted, poses, (0, 1), np.eye(3) * 1e-9) == expected
+
+
 def test_a_key_picture_keeps_what_features_look_like_in_a_byte_each() -> None:
     points, looks, truth = place()
     picture = seen(truth[0], points, looks, 0.0)
     again = KeyPicture.unpacked(picture.packed())
-    np.testing.assert_array_equal(again.looks, picture.looks)
+    np.testing.assert_array_equal(again.codes, picture.codes)
     whole = KeyPicture.of(CENTRE, points, np.ones(len(points)), looks)
-    assert whole.looks.nbytes == looks.size and np.linalg.norm(whole.descriptors - looks, axis=1).max() < 0.02
+    assert whole.codes.nbytes == looks.size and np.linalg.norm(whole.descriptors - looks, axis=1).max() < 0.02
 
 
 def test_old_pictures_are_let_go() -> None:

@@ -1,6 +1,7 @@
 """A camera's pose in a saved map: claimed where key pictures agree on it, and not where two places look alike."""
 
 from collections.abc import Iterator
+from copy import deepcopy
 from pathlib import Path
 
 import numpy as np
@@ -75,4 +76,12 @@ def test_a_state_whose_key_pictures_have_another_layout_is_refused_by_its_name(t
     core = PictureTrajectory()
     write_state(tmp_path, {**core.identity, "key_picture_layout": 1}, {})
     with pytest.raises(StateError, match="was saved with key_picture_layout 1; here it is 2"):
+        read_state(tmp_path, core.identity)
+
+
+def test_a_state_from_before_a_setting_was_there_is_refused_by_its_name(tmp_path: Path) -> None:
+    core, older = PictureTrajectory(), deepcopy(PictureTrajectory().identity)
+    del older["camera"]["loops"]["likelier"]
+    write_state(tmp_path, older, {})
+    with pytest.raises(StateError, match=r"another version: the setting camera.loops.likelier is new here$"):
         read_state(tmp_path, core.identity)

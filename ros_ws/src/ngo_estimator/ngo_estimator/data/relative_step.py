@@ -63,7 +63,7 @@ class RelativeStep:
     ``robot_odom_xyyaw`` (3,) is the newer frame in the robot's own ``odom``, where the robot has one: not a number
     where it is not known at this stamp.
     ``unlikeness`` of the newer frame: over 1 it is unlike what the networks learned from, 0 where nobody knows.
-    The scan of an ``unsure`` step does not say where it was taken.
+    The scan of an ``unsure`` step does not say where it was taken: only in the front end, messages do not carry it.
     With ``segment`` no scan measured the motion: the covariance says how little is known, and only loops tie the frames
     behind it to those before.
     """

@@ -14,7 +14,9 @@ LAYOUT = 2
 
 _LENGTHS = (8, 512)
 _HEADER = 4
+
 _MOST = 127.0
+"""The largest number of a code: all of a byte, but for -128."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -25,13 +27,13 @@ class KeyPicture:
         centre: of the camera in the robot's base frame ``(3,)``, m.
         rays: unit vectors ``(n, 3)`` to the features, in base axes.
         std_rad: deviations ``(n,)`` of the rays.
-        looks: directions ``(n, d)`` of the descriptors as int8, a quarter of their memory.
+        codes: directions ``(n, d)`` of the descriptors as int8, a quarter of their memory.
     """
 
     centre: Array
     rays: Array
     std_rad: Array
-    looks: np.ndarray
+    codes: np.ndarray
 
     @classmethod
     def of(cls, centre: Array, rays: Array, std_rad: Array, descriptors: np.ndarray) -> "KeyPicture":
@@ -42,8 +44,8 @@ class KeyPicture:
     @property
     def descriptors(self) -> np.ndarray:
         """Unit vectors ``(n, d)`` float32: the nearer two are, the more alike the features."""
-        looks = self.looks.astype(np.float32)
-        unit: np.ndarray = looks / np.maximum(np.linalg.norm(looks, axis=1, keepdims=True), 1.0)
+        codes = self.codes.astype(np.float32)
+        unit: np.ndarray = codes / np.maximum(np.linalg.norm(codes, axis=1, keepdims=True), 1.0)
         return unit
 
     def __len__(self) -> int:
@@ -51,7 +53,7 @@ class KeyPicture:
 
     def packed(self) -> np.ndarray:
         """All of it in one vector ``(4 + n (4 + d),)``, as the place code of a step carries it."""
-        head = (self.looks.shape[1], *self.centre)
+        head = (self.codes.shape[1], *self.centre)
         rows = np.concatenate((self.rays, self.std_rad[:, None], self.descriptors), axis=1)
         return np.concatenate((head, rows.ravel())).astype(np.float32)
 
@@ -86,7 +88,7 @@ def matches(first: KeyPicture, second: KeyPicture, ratio: float) -> np.ndarray:
     Args:
         ratio: the second best must be so many times as far away (Lowe 2004).
     """
-    if min(len(first), len(second)) < 2 or first.looks.shape[1] != second.looks.shape[1]:
+    if min(len(first), len(second)) < 2 or first.codes.shape[1] != second.codes.shape[1]:
         return np.zeros((0, 2), np.int64)
     alike = first.descriptors @ second.descriptors.T
     best, back = alike.argmax(1), alike.argmax(0)

@@ -152,8 +152,10 @@ def _difference(key: str, saved: Any, here: Any) -> str:
     """The first difference of two values, which may be nested."""
     if isinstance(saved, dict) and isinstance(here, dict):
         for inner in sorted({*saved, *here}):
-            if saved.get(inner) != here.get(inner):
-                return _difference(f"{key}.{inner}", saved.get(inner), here.get(inner))
+            if inner not in saved:
+                return f"another version: the setting {key}.{inner} is new here"
+            if saved[inner] != here.get(inner):
+                return _difference(f"{key}.{inner}", saved[inner], here.get(inner))
     return f"{key} {json.dumps(saved)}; here it is {json.dumps(here)}"
 
 
