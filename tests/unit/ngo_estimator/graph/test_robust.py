@@ -174,6 +174,16 @@ def test_right_loops_are_believed_where_the_steps_alone_are_better_than_stated()
     assert solution.step_scale < 0.1 and solution.loop_scale == 1.0
 
 
+def test_whole_loops_that_are_stated_too_well_are_often_noticed_beside_right_steps() -> None:
+    problems = [square(6, seed)[0] for seed in range(1, 11)]
+    solutions = [Robust().correct(replace(problem, loops=problem.loops.scaled(0.25))) for problem in problems]
+    noticed = [solution for solution in solutions if solution.loop_scale != 1.0]
+    assert len(noticed) > 5
+    for solution in noticed:
+        assert (solution.loop_weights > 0.0).mean() > 0.9
+        assert solution.step_scale == 1.0 and solution.loop_scale == pytest.approx(4.0, rel=0.5)
+
+
 @pytest.mark.parametrize("metric", [True, False])
 def test_a_wrong_loop_that_is_written_often_is_one_witness(metric: bool) -> None:
     problem, true = square(4, seed=5, metric=metric)

@@ -138,16 +138,18 @@ def test_what_is_due_is_done_before_a_state_is_saved() -> None:
 def test_the_round_trip_holds_at_each_frame_of_a_meta_pose_where_updates_go_on_from_the_last_solution(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    core, steps, resumed = networks("loops", 1, window_frames=160), make_steps(150), []
+    core, steps, updates, others = networks("loops", 1, window_frames=160), make_steps(150), set(), []
     drive(core, steps[:120], range(0))
-    resume = core._back_end._resume
-    monkeypatch.setattr(core._back_end, "_resume", lambda *given: (resumed.append(len(others)), resume(*given))[1])
-    others = []
+    for name in ("_anneal", "_resume"):
+        update = getattr(core._back_end, name)
+        monkeypatch.setattr(
+            core._back_end, name, lambda *given, of=name, update=update: (updates.add(of), update(*given))[1]
+        )
     for step in steps[120:136]:
         for other in [core, *others]:
             other.update(step)
         others.append(networks("loops", 1, window_frames=160).restored(core.state()))
-    assert resumed
+    assert updates == {"_anneal", "_resume"}
     for other in others:
         assert_same(core, other)
 

@@ -144,7 +144,7 @@ def _from_nothing(problem: GraphProblem, report: Progress, least_scale: float) -
 def _with_wider_loops(problem: GraphProblem, solution: CorrectedGraph, least_scale: float) -> CorrectedGraph:
     """The solution where whole loops have larger variances than one scale for steps and loops gives them.
 
-    Residuals do not say that they are smaller: poses bend to loops.
+    Residuals do not say that they are smaller: poses bend to loops. A warm solution goes by the one scale again.
     """
     metric = problem.loops.degrees == 3
     loops, area = problem.loops[metric], map_area(problem.poses)
