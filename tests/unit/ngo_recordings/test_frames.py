@@ -3,6 +3,7 @@
 import math
 from collections import Counter
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -196,6 +197,26 @@ def test_depth_becomes_a_channel_and_images_without_it_are_left_out_and_counted(
     assert [frame.action for frame in found] == [None, *[1] * 8]
 
 
+@pytest.mark.parametrize("unit", [0.0, 1e-3])
+def test_where_no_topic_has_stamps_of_a_clock_the_times_of_the_recording_count(tmp_path: Path, unit: float) -> None:
+    depth = np.ones((2, 8, 1), np.float32)
+    entries = [*drive(), *(("/depth", stamp(k), m.image(0, depth, "32FC1")) for k in range(30))]
+    velocity = m.make("geometry_msgs/msg/TwistStamped", m.header(0), m.twist(0.5, 0.0, 0.0))
+    entries += [("/velocity", stamp(k), replace(velocity, header=m.header(0))) for k in range(30)]
+    for _, time_ns, message in entries:
+        message.header = m.header(round(unit * time_ns))
+    given = TopicArguments(depth="/depth", twist="/velocity")
+    path = m.write_mcap(tmp_path / "a.mcap", sorted(entries, key=lambda entry: entry[1]))
+    with open_recording([path]) as recording:
+        topics = choose_topics(recording, given)
+        assert len(recording.notes) == 5
+        found = list(frames(recording, topics))
+    assert [frame.stamp_ns for frame in found] == [stamp(k) for k in range(30)]
+    for k, frame in enumerate(found):
+        assert frame.action == (None if k == 0 else (k - 1) % 3) and (frame.twist_xyyaw is None) == (k == 0)
+        assert frame.pose_xyyaw is not None and frame.pose_xyyaw[0] == pytest.approx(k)
+
+
 def test_scans_keep_their_geometry_and_may_change_their_number_of_rays(tmp_path: Path) -> None:
     entries = [("/scan", stamp(k), m.scan(stamp(k), np.full(8 + k % 2, 1.5))) for k in range(4)]
     found = read(m.write_mcap(tmp_path / "a.mcap", entries), RecordingTopics("/scan"))
@@ -225,14 +246,11 @@ def test_side_information_that_never_comes_is_not_waited_for(tmp_path: Path) -> 
         assert len(taken) <= 50 + 25, "2 s of the recording are 20 images"
 
 
-def test_images_of_several_sizes_or_without_stamps_are_refused(tmp_path: Path) -> None:
+def test_images_of_several_sizes_are_refused(tmp_path: Path) -> None:
     entries = drive(5)
     entries.append(("/image", stamp(5), m.image(stamp(5), np.zeros((4, 8, 3), np.uint8))))
     with pytest.raises(RecordingError, match=r"/image at 5.500000000 s is \(4, 8, 3\) after images of \(2, 8, 3\)"):
         read(m.write_mcap(tmp_path / "a.mcap", entries))
-    unstamped = [("/image", stamp(k), m.image(0, pixels(k))) for k in range(5)]
-    with pytest.raises(RecordingError, match="images of /image have no stamps"):
-        read(m.write_mcap(tmp_path / "b.mcap", unstamped), RecordingTopics("/image"))
 
 
 def test_damaged_images_are_counted_where_that_is_asked_for(tmp_path: Path) -> None:

@@ -137,10 +137,6 @@ class _Frames:
 
     def _arrived(self, message: Message) -> Iterator[Frame]:
         stamp_ns = header_stamp_ns(message.value)
-        if stamp_ns == 0 and self._newest_ns == 0:
-            raise RecordingError(
-                f"images of {self._topics.image} have no stamps (all are 0): the driver must stamp them, or record anew"
-            )
         if self._newest_ns is not None and stamp_ns <= self._newest_ns - RESTART_NS:
             yield from self._take_all()
             self._before_ns = self._newest_ns = None

@@ -8,28 +8,33 @@ from typing import Any
 
 import numpy as np
 
-_LOOK, _STRIDE = 60, 10
-"""Messages that are looked at, and how far apart those are that are compared: several may carry one stamp."""
+_APART_NS, _MOST = 1_000_000_000, 5000
+"""Log time between messages that are compared, for many are recorded at once, and how many are looked at."""
 
-_PACE = 50.0
+_PACE = 300.0
 """A simulation, and a recording that is played, run up to so many times faster or slower than the recorder's clock."""
 
 
 def stamp_fault(messages: Iterable[Any]) -> str:
     """What is wrong with the stamps of a topic by the times at which its messages were recorded, in words; nothing
     where they are right, or nothing tells it."""
-    times = []
-    for message in islice(messages, _LOOK):
+    times: list[tuple[int, int]] = []
+    for message in islice(messages, _MOST):
         if (header := getattr(message.value, "header", None)) is None:
             return ""
         times.append((int(header.stamp.sec) * 10**9 + int(header.stamp.nanosec), message.log_time_ns))
-    apart = np.array(times[_STRIDE:], np.float64) - np.array(times[:-_STRIDE], np.float64)
-    if not len(apart):
+        if message.log_time_ns - times[0][1] >= 2 * _APART_NS:
+            break
+    stamped, recorded = np.array(times, np.int64).reshape(-1, 2).T
+    later = np.searchsorted(recorded, recorded + _APART_NS)
+    earlier = np.flatnonzero(later < len(times))
+    if not len(earlier):
         return ""
-    stamped, recorded = np.median(apart, axis=0).tolist()
-    if recorded <= 0.0 or recorded / _PACE < stamped < recorded * _PACE:
+    later = later[earlier]
+    pace = float(np.median((stamped[later] - stamped[earlier]) / (recorded[later] - recorded[earlier])))
+    if 1.0 / _PACE < pace < _PACE:
         return ""
-    return f"run {stamped / recorded:.3g} times as fast as the clock" if stamped else "stand still"
+    return f"run {pace:.3g} times as fast as the clock" if pace else "stand still"
 
 
 def stamp_as_recorded(message: Any) -> None:

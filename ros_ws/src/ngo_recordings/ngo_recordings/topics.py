@@ -187,11 +187,13 @@ def choose_topics(
         names = _filled(recording, (IMU_TYPE,))
         imu = min((name for name in names if _related(name, image)), default=_only(names))
     more_scans = tuple(name for name in more if name is not None)
-    sensors = (image, *more_scans, imu, None if wheels is None else wheels.topic)
-    recording.check_stamps(name for name in sensors if name is not None)
+    depth = _given(recording, "depth", given.depth, (IMAGE_TYPE,))
+    sources = (wheels.topic if wheels is not None else None, truth.topic if truth is not None else None)
+    used = (image, *more_scans, depth, action, twist, imu, *sources)
+    recording.check_stamps(name for name in used if name is not None)
     return RecordingTopics(
         image=image,
-        depth=_given(recording, "depth", given.depth, (IMAGE_TYPE,)),
+        depth=depth,
         action=action,
         twist=twist,
         ground_truth=truth,
