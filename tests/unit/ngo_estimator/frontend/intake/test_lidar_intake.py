@@ -1,7 +1,7 @@
 """Faults of drivers do not reach the path: what a sound scanner gives is what comes out."""
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -13,7 +13,7 @@ from ngo_estimator.geometry.scan_points import Mounting
 from ngo_estimator.offline.lidar_run import LidarRun
 from ngo_estimator.offline.recorded import RecordedRun
 from ngo_estimator.slam.scan_trajectory import ScanTrajectory
-from ngo_recordings.scan_stream import LidarScan
+from ngo_recordings.scan_stream import LidarScan, WheelPose
 from tests.unit.ngo_estimator.ray_casting import ROOM, cast
 
 STEP_NS = 100_000_000
@@ -50,7 +50,9 @@ def turn(pose: Array, k: float, noise: np.random.Generator) -> LidarScan:
 
 
 def errors(
-    records: list[LidarScan], true: list[Array], mounting_of: Callable[[str], Mounting | None] = lambda _: FRONT
+    records: Sequence[LidarScan | WheelPose],
+    true: list[Array],
+    mounting_of: Callable[[str], Mounting | None] = lambda _: FRONT,
 ) -> tuple[Array, LidarRun]:
     """How far each pose of the path is off (m), and the run."""
     run = LidarRun(MixtureLidar(), ScanTrajectory(iterations_per_step=1), mounting_of)
@@ -142,3 +144,14 @@ def test_scans_whose_stamps_are_stray_do_not_end_a_path() -> None:
     off, run = errors(records, true)
     assert len(off) == 38 and off.max() < 0.03
     assert run.remarks() == ["2 of the scans are stamped far from those before and after: left out"]
+
+
+def test_a_scanner_that_froze_does_not_hold_a_robot_whose_wheels_drive() -> None:
+    """It is held for the 0.3 m by which that is known, of 2 m."""
+    noise, true, records = np.random.default_rng(0), poses(100), []
+    for k, pose in enumerate(true):
+        seen = turn(true[40] if 40 < k < 80 else pose, k, noise)
+        records += [WheelPose(seen.stamp_ns, pose), replace(seen, ranges=records[81].ranges) if 40 < k < 80 else seen]
+    off, run = errors(records, true)
+    assert off.max() < 0.35 and len(off) < 75
+    assert any("while the wheels drive" in line for line in run.remarks())

@@ -88,7 +88,27 @@ def test_limits_that_contradict_all_ranges_are_told_and_not_used(limits_m: tuple
     for scan in drive(10):
         found = scanner.correct(replace(scan, range_min=limits_m[0], range_max=limits_m[1]), 0.0)
     assert found is not None and len(found.hits()) == len(scan.hits())
-    assert scanner.remarks("laser") == ["laser: most of what it measures is beyond its limits: they are not used"]
+    assert scanner.remarks("laser") == ["laser: nearly all it measures is beyond its limits: they are not used"]
+
+
+@pytest.mark.parametrize(("share", "limit_m"), [(0.6, 60.0), (0.95, 60.0), (0.0, 2.0)])
+def test_limits_count_where_nothing_comes_back_or_much_is_within_them(share: float, limit_m: float) -> None:
+    """Where nothing comes back the driver says 65 to 66 m; without these, most of the room is beyond the limit."""
+    noise, scanner = np.random.default_rng(1), Scanner()
+    for scan in drive(10):
+        ranges = np.where(noise.random(RAYS) < share, noise.uniform(65.0, 66.0, RAYS), scan.ranges).astype(np.float32)
+        found = scanner.correct(replace(scan, ranges=ranges, range_max=limit_m), 0.0)
+        assert found is not None and 0.0 < found.range_max <= limit_m
+    assert (scan.ranges > 2.0).mean() > 0.5 and scanner.remarks("laser") == []
+
+
+def test_limits_that_are_not_used_stay_so_and_one_scan_is_not_enough() -> None:
+    scanner, once = Scanner(), Scanner()
+    for k, scan in enumerate(drive(10)):
+        found = scanner.correct(replace(scan, range_max=0.5 if k < 5 else 30.0), 0.0)
+        alone = once.correct(replace(scan, range_max=0.5 if k % 3 else 30.0), 0.0)
+        assert alone is not None and alone.range_max > 0.0
+    assert found is not None and found.range_max == 0.0 and once.remarks("laser") == []
 
 
 def test_a_driver_that_begins_with_ranges_far_away_is_in_metres_again() -> None:
@@ -126,18 +146,20 @@ def test_a_scan_that_is_published_again_is_left_out(late_ns: int) -> None:
     assert "scans are the one before once more" in scanner.remarks("laser")[0]
 
 
-@pytest.mark.parametrize(("way", "sees", "counted"), [(0.08, True, 4), (0.0, True, 40), (0.08, False, 40)])
+@pytest.mark.parametrize(
+    ("way", "sees", "counted"), [(0.08, True, 4), (0.0, True, 99), (0.08, False, 99), (0.005, True, 99)]
+)
 def test_a_scanner_that_froze_repeats_its_scan_while_the_wheels_drive(way: float, sees: bool, counted: int) -> None:
-    """A robot that stands, or sees nothing, sees the same."""
+    """A robot that stands, creeps, or sees nothing, sees the same."""
     scanner, (scan, other) = Scanner(), drive(2)
     scan = scan if sees else replace(scan, ranges=np.full(RAYS, np.inf, np.float32))
     kept = 0
-    for k in range(40):
+    for k in range(99):
         driven = lambda from_ns, now=k: np.array((way * (now - from_ns / 10**8), 0.0, 0.0))  # noqa: E731
         kept += scanner.correct(replace(scan, stamp_ns=k * 10**8), 0.0, driven) is not None
     assert kept == counted
-    assert any("while the wheels drive" in line for line in scanner.remarks("laser")) == (counted < 40)
-    assert scanner.correct(replace(other, stamp_ns=40 * 10**8), 0.0, driven) is not None
+    assert any("while the wheels drive" in line for line in scanner.remarks("laser")) == (counted < 99)
+    assert scanner.correct(replace(other, stamp_ns=99 * 10**8), 0.0, driven) is not None
 
 
 def test_a_simulated_robot_that_stands_sees_the_same_at_its_usual_pace() -> None:

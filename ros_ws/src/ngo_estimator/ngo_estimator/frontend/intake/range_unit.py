@@ -1,4 +1,4 @@
-"""Ranges or limits that a driver gives in another unit: no scanner sees so far, or mostly beyond its limits."""
+"""Ranges or limits that a driver gives in another unit: no scanner sees so far, or hardly within its limits."""
 
 from dataclasses import replace
 
@@ -20,6 +20,9 @@ _DISTINCT = 0.25
 """Share of the ranges that differ: a code for no return is one value."""
 
 _SCANS = 3
+_SPREAD = 1.1
+"""Ratio of the ranges of nearly all rays: where it is less, nothing came back, by a value that jitters."""
+
 _METRES = np.float32(0.001)
 
 
@@ -33,17 +36,17 @@ class RangeUnit:
 
     def metres(self, scan: LidarScan) -> LidarScan:
         """The scan in metres, also its limits where these are not."""
-        near, middle, far = _quantiles(scan.ranges)
+        near, far = _nearly_all(scan.ranges)
         doubted = 0.0 < far < _FAR if self.millimetres else near > _FAR
         self._doubted = self._doubted + 1 if doubted else 0
         if self._doubted >= _SCANS:
             self.millimetres, self._doubted = not self.millimetres, 0
         low, high = scan.range_min, scan.range_max
         if not self.millimetres:
-            if not (_LEAST_LIMIT_M < low > far > 0.0 or 0.0 < high < middle):
-                return scan
-            self._beyond += 1
-            return replace(scan, range_min=0.0, range_max=0.0)
+            if self._beyond < _SCANS:
+                beyond = _LEAST_LIMIT_M < low > far > 0.0 or 0.0 < high < near < far / _SPREAD
+                self._beyond = self._beyond + 1 if beyond else 0
+            return scan if self._beyond < _SCANS else replace(scan, range_min=0.0, range_max=0.0)
         low = 0.001 * low if low > _LEAST_LIMIT_M else low
         high = 0.001 * high if high > max(near, _FAR) else high
         return replace(scan, ranges=scan.ranges * _METRES, range_min=low, range_max=high)
@@ -52,15 +55,14 @@ class RangeUnit:
         """In words; nothing where ranges and limits are in metres."""
         if self.millimetres:
             return "its ranges are in millimetres: taken so"
-        return "most of what it measures is beyond its limits: they are not used" if self._beyond >= _SCANS else ""
+        return "nearly all it measures is beyond its limits: they are not used" if self._beyond >= _SCANS else ""
 
 
-def _quantiles(ranges: np.ndarray) -> tuple[float, float, float]:
-    """Between which nearly all ranges lie, with their median in the middle; 0 where these are few, or alike."""
+def _nearly_all(ranges: np.ndarray) -> tuple[float, float]:
+    """Between which nearly all ranges lie; 0 and 0 where these are few, or alike."""
     seen = ranges[np.isfinite(ranges) & (ranges > 0.0)]
     if len(seen) < _FEWEST or len(np.unique(seen)) < _DISTINCT * len(seen):
-        return 0.0, 0.0, 0.0
+        return 0.0, 0.0
     least = round(_NEARLY_ALL * len(seen))
-    at = [least, len(seen) // 2, len(seen) - 1 - least]
-    near, middle, far = np.partition(seen, at)[at].tolist()
-    return near, middle, far
+    near, far = np.partition(seen, (least, len(seen) - 1 - least))[[least, -1 - least]]
+    return float(near), float(far)
