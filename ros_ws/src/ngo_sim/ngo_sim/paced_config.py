@@ -26,7 +26,7 @@ class PacedConfig(FramedSettings):
     )
     rate: float = setting(
         10.0,
-        "Frames a second of wall time; 0: as fast as the subscribers take them, none lost.",
+        "Frames (scans or images) a second of wall time; 0: as fast as the subscribers take them, none lost.",
         minimum=0.0,
         maximum=10_000.0,
     )
