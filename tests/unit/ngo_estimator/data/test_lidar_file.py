@@ -74,7 +74,7 @@ def test_a_bad_file_is_one_line(tmp_path: Path, values: Any, told: str) -> None:
     [
         ({"key_m": 0.0}, "key_m is 0.0"),
         ({"keys_m": 0.3}, "unknown keys"),
-        ({"first_weights": [0.4, 0.2, 0.1, 0.2, 0.07, 0.03]}, "5 hypotheses"),
+        ({"first_weights": [0.5, 0.2, 0.2, 0.07, 0.03]}, "6 hypotheses"),
     ],
 )
 def test_a_bad_setting_of_the_front_end_is_one_line(tmp_path: Path, values: dict[str, Any], told: str) -> None:
