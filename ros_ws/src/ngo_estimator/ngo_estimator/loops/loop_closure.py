@@ -124,6 +124,15 @@ class Loops:
         return dataclasses.replace(self, **per_loop)  # type: ignore[arg-type]
 
     @cached_property
+    def description(self) -> Tensor:
+        """What gates see of each loop under all poses ``(batch, loops, 7)``."""
+        of = library(self.logit)
+        beliefs = of.stack((self.similarity, self.logit / 5.0), axis=-1)
+        length = self.log_length[..., None] / 3.0
+        seen: Tensor = of.concatenate((beliefs, self.log_scale, self.spread - self.log_scale, length), axis=-1)
+        return seen
+
+    @cached_property
     def log_length(self) -> Tensor:
         """Logarithm of how many meta-poses lie on each loop ``(batch, loops)``."""
         length = self.end - self.start + 1 if self.length is None else self.length

@@ -170,10 +170,8 @@ class RobustLoopGate(nn.Module):
         both = variance * components
         errors, drift = (_times(x, merged) for x in (residuals**2, expected_variance))
         squared = (errors / (both + annealing * drift)).sum(-1)
-        beliefs = of.stack((loops.similarity, loops.logit / 5.0), axis=-1)
-        unlike, length = loops.spread - loops.log_scale, loops.log_length[..., None] / 3.0
         numbers = of.stack((of.log1p(squared), of.full_like(squared, annealing)), axis=-1)
-        seen = (beliefs, loops.log_scale, unlike, length, of.log1p(errors / both) / 3.0, numbers)
+        seen = (loops.description, of.log1p(errors / both) / 3.0, numbers)
         belief = self._network(of.concatenate(seen, axis=-1))
         sure = 0.5 + 0.5 * of.tanh(0.5 * loops.logit + 1.0 + 2.0 * belief[..., 0])  # the logistic function
         gate = sure * loops.valid / (1.0 + squared / self.WIDTH) ** 2
