@@ -26,7 +26,7 @@ from training.common.command_line import check_at_least, run_command
 from training.data.feature_store import open_store
 from training.data.worlds import world_named
 from training.prerequisites import Scripts, Wanted, prepare
-from training.report import attention, figures, results_page, tables
+from training.report import figures, results_page, tables
 from training.report.folders import Folders
 from training.report.training_records import trainings_json
 from training.scoring import prefix_errors as prefix_errors_module
@@ -64,7 +64,6 @@ TABLES = {
 }
 """The modules of tables that are not of a world of mazes."""
 
-_ATTENTION_TRAJECTORIES = 24
 _CODE = (row_estimators, prefix_errors_module, neural_graph_optimizer, overlaps, pair_measurement, errors)
 
 
@@ -148,7 +147,6 @@ def summary(
     """The content of the JSON."""
     world, prefixes = sources.world, sorted(arguments.prefixes)
     steps = next(iter(stores.values()))["relative"].shape[1]
-    few = {table: {k: v[:_ATTENTION_TRAJECTORIES] for k, v in arrays.items()} for table, arrays in stores.items()}
     return {
         "split": arguments.split,
         "trajectories": arguments.trajectories,
@@ -162,7 +160,6 @@ def summary(
         "path_m": {
             name: tables.path_json(arrays["truth"], sorted({*prefixes, steps})) for name, arrays in stores.items()
         },
-        "attention": {name: attention.attention_json(sources, arrays) for name, arrays in few.items()},
         "trainings": trainings_json(sources, arguments.seeds),
     }
 

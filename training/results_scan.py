@@ -7,7 +7,6 @@ trained or chosen on, and beside other programs. The command writes ``training/r
 ``docs/results_scan.md`` and ``docs/images/results_scan_*.png``. Run it again to continue after a stop.
 """
 
-import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -15,22 +14,19 @@ from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
-from rich.console import Console
 
 from ngo_recordings import mounting, recording, scan_stream, topics
 from ngo_sim import building2d, episodes, maze2d
 from training.common import records
 from training.common.command_line import check_among, check_at_least, run_command
-from training.data import building_drives, scans, simulated_drives
+from training.data import building_drives, simulated_drives
 from training.data.building_drives import BUILDING_TEST_SEEDS, building_drive
-from training.data.scans import CONDITIONS
-from training.data.simulated_drives import maze_drive, scanned_maze_drive
+from training.data.simulated_drives import maze_drive
 from training.data.worlds import WORLDS
 from training.recordings import lidar_logs
 from training.recordings.lidar_logs import log_drive, log_identity, logs_below
 from training.report import lidar_figures, lidar_page
 from training.report.folders import Folders
-from training.scoring.lidar_bars import PUBLISHED, Bar, bars
 from training.scoring.lidar_rows import ROWS, Row
 from training.scoring.lidar_scores import scored_rows, with_runs
 from training.scoring.statistics import compare, mean_interval
@@ -49,7 +45,7 @@ from training.scoring.table import (
 
 _ALIASED_FIRST = 500  # of the test seeds: aliased buildings are others than those of the table without aliasing
 _BUILDINGS = (building2d, building_drives)
-_MAZES = (maze2d, episodes, scans, simulated_drives)
+_MAZES = (maze2d, episodes, simulated_drives)
 _READ = (mounting, recording, scan_stream, topics, lidar_logs)
 _MOST_SCANS = 20_000  # of a building: some robots stand for hours
 _PAIRED = ("ate_m", "within_three_deviations", "negative_log_likelihood")
@@ -58,7 +54,11 @@ _ABLATED = ("buildings", "aliased")
 _WITH_WHEELS = ("logs", "buildings", "aliased", "slip")
 _SLIP_ROWS = ("wheels", "ours")
 _SETTINGS = ("buildings", "first_building", "ablation", "length_m", "mazes", "frames")
-_SCANNER_ROWS = ("ours_without_wheels",)
+_PUBLISHED: dict[str, dict[str, dict[str, float]]] = {
+    "aces": {"cartographer_published": {"translation_m": 0.0375, "rotation_deg": 0.373}},
+    "mit-csail": {"cartographer_published": {"translation_m": 0.0319, "rotation_deg": 0.369}},
+}
+"""By log and row, not run here: from Hess et al., "Real-time loop closure in 2D LIDAR SLAM" (ICRA 2016)."""
 
 
 @dataclass(frozen=True)
@@ -72,10 +72,10 @@ class Arguments(Folders):
     """Number of the first one among the test seeds: others than those of the tables that are published."""
     length_m: float = 500.0  # Way that the robot drives in a building.
     ablation: int = 5  # How many of these get the rows of the ablation; and how many buildings have slipping wheels.
-    mazes: int = 8  # Mazes of each scanner; 8 for the comparison with the networks of version 0.1.0.
+    mazes: int = 8  # Mazes.
     frames: int = 2000  # Scans in a maze.
     rows: tuple[str, ...] = ()  # Rows to measure, by name; none: all. Tables that are measured hold these alone.
-    tables: tuple[Literal["logs", "buildings", "aliased", "slip", "maze2d", "scanners"], ...] = ()
+    tables: tuple[Literal["logs", "buildings", "aliased", "slip", "maze2d"], ...] = ()
     """Tables to measure; none: all. The others hold what earlier runs measured, or what is published."""
     known: bool = False
     """Measure nothing: the tables hold what earlier runs of this command measured, and say of how many drives."""
@@ -100,51 +100,36 @@ def main(arguments: Arguments) -> dict[str, Any]:
         name: _measured(arguments, name, drives, slip_rows if name == "slip" else rows)
         for name, drives in _plans(arguments, skipped).items()
     }
-    scanner_rows = {name: row for name, row in rows.items() if name in _SCANNER_ROWS}
-    scanners = {
-        condition: _measured(arguments, condition, _scanner_plan(arguments, condition), scanner_rows)
-        for condition in CONDITIONS
-    }
-    found = bars(tables, scanners)
     logs = tables.pop("logs", {})
     result: dict[str, Any] = {
         **arguments.made("scan"),
         "settings": {name: getattr(arguments, name) for name in _SETTINGS},
         "logs": {name: {**_log_numbers(scored), **_published(name)} for name, scored in logs.items()},
         "tables": {name: _table_numbers(table) for name, table in tables.items()},
-        "scanners": {name: _table_numbers(table) for name, table in scanners.items()},
         "paired": {name: _paired(table) for name, table in {"logs": logs, **tables}.items()},
-        "bars": [bar.as_json() for bar in found],
         "skipped": skipped,
-        "failed": _failures({"logs": logs, **tables, **scanners}),
+        "failed": _failures({"logs": logs, **tables}),
     }
     _keep_published(result, arguments.published("scan"))
     images = lidar_figures.draw(arguments.images, logs, tables, result["earlier"])
-    _print(found, skipped)
+    for text in skipped:
+        print(f"skipped  {text}")
     return arguments.publish("scan", result, lidar_page.page(result, images))
 
 
 def _keep_published(result: dict[str, Any], published: Mapping[str, Any]) -> None:
-    """Take over the tables that are published and not measured anew, with their bars and failures.
+    """Take over the tables that are published and not measured anew, with their failures.
 
     ``earlier`` of the result names the revision and the settings of each of them.
     """
-    result["earlier"], measured = {}, list[str]()
-    places = {**dict.fromkeys(result["tables"], "tables"), **dict.fromkeys(result["scanners"], "scanners")}
-    for name in ("logs", *places):
-        new: dict[str, Any] = result[places[name]] if name in places else result
-        old = published.get(places[name], {}) if name in places else published
-        if new[name]:
-            measured += [name, *(result["logs"] if name == "logs" else ())]
-        elif old.get(name):
+    result["earlier"] = {}
+    for name in ("logs", *result["tables"]):
+        new, old = (result, published) if name == "logs" else (result["tables"], published.get("tables", {}))
+        if not new[name] and old.get(name):
             new[name] = old[name] if name == "logs" else _known(old[name])
             result["paired"][name] = _known(published["paired"].get(name, {}))
             of = {"revision": published["revision"], "settings": published["settings"]}
             result["earlier"][name] = published.get("earlier", {}).get(name, of)
-    found = [bar["name"] for bar in result["bars"]]
-    for bar in published.get("bars", ()):
-        if bar["name"] not in found and not any(name in bar["name"] for name in measured):
-            result["bars"].append(bar)
     result["failed"] += [line for line in published.get("failed", ()) if line.partition(",")[0] in result["earlier"]]
 
 
@@ -189,19 +174,6 @@ def _plans(arguments: Arguments, skipped: list[str]) -> dict[str, Sequence[Drive
     return {"logs": of_logs, **plans}
 
 
-def _scanner_plan(arguments: Arguments, condition: str) -> Sequence[Drive]:
-    changes = CONDITIONS[condition]
-    return [
-        Drive(
-            f"maze_{seed}",
-            f"scanned maze {seed}, {condition}, {json.dumps(changes)}, {arguments.frames} frames",
-            partial(scanned_maze_drive, seed, arguments.frames, changes),
-            _MAZES,
-        )
-        for seed in WORLDS["maze2d"].table_seeds("perfect", "validation")[: arguments.mazes]
-    ]
-
-
 def _building(arguments: Arguments, name: str, seed: int) -> Drive:
     slips = _SLIPS_PER_KM if name == "slip" else None
     named = "" if slips is None else f", {slips:g} slips a km"
@@ -212,7 +184,7 @@ def _building(arguments: Arguments, name: str, seed: int) -> Drive:
 
 def _measured(arguments: Arguments, name: str, drives: Sequence[Drive], rows: Mapping[str, Row]) -> Table:
     """A table; rows of the ablation have its first drives alone, those that need wheels no mazes."""
-    folder = arguments.runs / "scan" / "results" / name.replace(" ", "_").replace("%", "percent").replace(",", "")
+    folder = arguments.runs / "scan" / "results" / name
     ablation = len(drives) if name == "logs" else arguments.ablation if name in _ABLATED else 0
     scored = scored_rows(rows, arguments.weights)
 
@@ -224,7 +196,7 @@ def _measured(arguments: Arguments, name: str, drives: Sequence[Drive], rows: Ma
         (with_runs(drive, arguments.weights), {key: scored[key] for key, row in rows.items() if is_asked(index, row)})
         for index, drive in enumerate(drives)
     ]
-    asked = not arguments.tables or ("scanners" if name in CONDITIONS else name) in arguments.tables
+    asked = not arguments.tables or name in arguments.tables
     return measure(plan, folder, name, known_only=arguments.known or not asked)
 
 
@@ -236,7 +208,7 @@ def _log_numbers(scored: Mapping[str, Measured]) -> dict[str, Numbers]:
 def _published(log: str) -> dict[str, Numbers]:
     return {
         row: {key: {"mean": value, "ci95": None} for key, value in numbers.items()}
-        for row, numbers in PUBLISHED.get(log, {}).items()
+        for row, numbers in _PUBLISHED.get(log, {}).items()
     }
 
 
@@ -286,15 +258,6 @@ def _failures(tables: Mapping[str, Table]) -> list[str]:
         for row, scored in rows.items()
         if scored.failed
     ]
-
-
-def _print(found: Sequence[Bar], skipped: Sequence[str]) -> None:
-    console = Console(highlight=False)
-    for bar in found:
-        limit = f"at most {bar.most:.4g}" if bar.least is None else f"at least {bar.least:.4g}"
-        console.print(f"{'met   ' if bar.met else 'MISSED'}  {bar.name}: {bar.value:.4g}, {limit}", soft_wrap=True)
-    for text in skipped:
-        console.print(f"skipped  {text}", soft_wrap=True)
 
 
 if __name__ == "__main__":

@@ -24,9 +24,9 @@ from training.recordings.lidar_logs import logs_below, relations_of
 from training.report import stress_page
 from training.report.folders import Folders, with_earlier
 from training.scoring import stress_tables
-from training.scoring.lidar_bars import stress_bars
 from training.scoring.lidar_rows import FRONT_ABLATION, ROWS
 from training.scoring.lidar_scores import scored_rows, with_runs
+from training.scoring.stress_bars import stress_bars
 from training.scoring.stress_cells import CLEAN, StressLog, cell_numbers
 from training.scoring.stress_tables import StressTable
 from training.scoring.table import Measured, measure

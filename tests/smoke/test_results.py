@@ -85,7 +85,6 @@ def test_the_page_shows_the_tables_and_every_figure(made: tuple[Path, dict[str, 
         assert page.count(f"| `{row}` |") >= 4  # whole trajectories and prefixes of two tables
     images = sorted((folder / "docs" / "images").iterdir())
     assert [image.name.removeprefix("results_maze2d_") for image in images] == [
-        "attention.png",
         "error_by_frames.png",
         "learning_curves.png",
         "percent_by_distance.png",

@@ -24,7 +24,7 @@ from training import (
 from training.common.records import RunError
 from training.data.feature_store import open_store
 from training.data.worlds import World, world_named
-from training.report import attention_map, figures
+from training.report import figures
 from training.report.maze_views import maze_and_start
 from training.scoring.network_odometry import open_odometry
 from training.scoring.table_rows import rows_of
@@ -65,8 +65,7 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Any:
                 mazes[table, split, index] = maze_and_start(world, table, split, index)
             return mazes[table, split, index]
 
-        for module in (figures, attention_map):
-            patch.setattr(module, "maze_and_start", drawn_once)
+        patch.setattr(figures, "maze_and_start", drawn_once)
         patch.setattr(tune_pose_graph, "GRID", tune_pose_graph.GRID[3:4])  # one group, as the unit tests try the rest
         yield folder, results.main(arguments(folder), toy.scripts("maze3d", folder))
 

@@ -15,7 +15,6 @@ from matplotlib.ticker import LogLocator, NullFormatter
 
 from ngo_sim.mazes import draw_maze
 from training.baselines.deepvo import DEEPVO
-from training.report import attention_map
 from training.report.maze_views import in_maze, maze_and_start
 from training.report.pictures import save
 from training.report.training_records import learning_curve, run_folder
@@ -100,12 +99,6 @@ def draw_all(
         "learning_curves",
         "Learning curves on validation: networks, and optimizers with the mean and range of the training seeds.",
         learning_curves(sources, len(result["seeds"])),
-    )
-    add(
-        "attention",
-        "Where one meta-pose looks in the last iteration, over the maze (it is the star; a dot is a meta-pose, the "
-        "darker and larger the more attention it gets) and over time, with the true revisits and its loop closures.",
-        attention_map.draw(sources, split, stores),
     )
     return images
 

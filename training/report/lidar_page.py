@@ -1,11 +1,10 @@
 """The page of the lidar's results in Markdown, made whole from the JSON."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import Any
 
 from training.report.page import figures, markdown, signed, with_interval
 from training.report.page import page as whole
-from training.scoring.lidar_bars import NETWORKS_POSITION_M
 from training.scoring.lidar_rows import ROWS
 
 _TITLES = {
@@ -35,8 +34,6 @@ def page(result: Mapping[str, Any], images: Mapping[str, str]) -> str:
         "correction was given: our front end's. Online is each pose as it was published. Speed is by computing time on "
         "one thread. Numbers in full are in [`training/results/scan.json`](../training/results/scan.json).",
         *_earlier(result["earlier"]),
-        "## Bars",
-        _bars(result["bars"]),
     ]
     if with_relations:
         parts += [
@@ -65,12 +62,8 @@ def page(result: Mapping[str, Any], images: Mapping[str, str]) -> str:
         ]
     parts += _ablation(result)
     parts += [
-        "## Mazes, scanners of many qualities",
-        f"Up to {settings['mazes']} validation mazes, {settings['frames']} scans each, no wheels; mean position RMSE "
-        "(m), aligned at the first pose alone. The last column is the networks of version 0.1.0 on 8 mazes of 2000 "
-        "scans.",
-        _scanners(result),
-        "`maze2d`, the simulator's own scanner:",
+        "## Mazes",
+        f"Up to {settings['mazes']} validation mazes of `maze2d`, {settings['frames']} scans each, no wheels.",
         _table(result["tables"]["maze2d"], _BUILDING_COLUMNS),
     ]
     parts += figures(images)
@@ -219,28 +212,6 @@ def _differences(paired: Mapping[str, Any]) -> str:
         if row not in _FED
     ]
     return markdown(["difference of", "to", *keys.values()], body)
-
-
-def _scanners(result: Mapping[str, Any]) -> str:
-    tables = {**result["scanners"], "maze2d": result["tables"]["maze2d"]}
-    body = [
-        [name, _cell(rows.get("ours_without_wheels", {}), "position_rmse_m"), f"{NETWORKS_POSITION_M[name]:.2f}"]
-        for name, rows in tables.items()
-    ]
-    return markdown(["scanner", "ours, without wheels", "networks of 0.1.0"], body)
-
-
-def _bars(found: Sequence[Mapping[str, Any]]) -> str:
-    body = [
-        [
-            bar["name"],
-            f"{bar['value']:.4g}",
-            f"at most {bar['at_most']:.4g}" if "at_most" in bar else f"at least {bar['at_least']:.4g}",
-            "yes" if bar["met"] else "**no**",
-        ]
-        for bar in found
-    ]
-    return markdown(["", "value", "bar", "met"], body)
 
 
 def _cell(numbers: Mapping[str, Any], key: str) -> str:

@@ -39,8 +39,6 @@ def page(result: dict[str, Any], images: dict[str, str], world: World) -> str:
             "The estimator has seen these steps alone, as in use.",
             _prefixes(table, metrics[0]),
         ]
-        if result["attention"].get(name):
-            parts += ["### Attention", _attention(result["attention"][name])]
     parts += [
         *figures(images),
         "## Trainings",
@@ -90,35 +88,6 @@ def _prefixes(table: dict[str, Any], metric: Metric) -> str:
         for row, entry in table.items()
     )
     return markdown(["Row", *(f"{length} steps" for length in lengths)], rows)
-
-
-def _attention(found: dict[str, Any]) -> str:
-    def cells(row: str, entry: dict[str, Any]) -> list[str]:
-        first, last = entry["iterations"][0], entry["iterations"][-1]
-        shares = [
-            100.0 * value["mean"] for value in (first["revisit_mass"], last["revisit_mass"], entry["uniform_share"])
-        ]
-        return [
-            f"`{row}`",
-            number(first["relative_entropy"]["mean"]),
-            number(last["relative_entropy"]["mean"]),
-            *(f"{number(share)} %" for share in shares),
-        ]
-
-    header = [
-        "Row",
-        "Entropy, first iteration",
-        "Entropy, last iteration",
-        "On revisits, first iteration",
-        "On revisits, last iteration",
-        "On revisits, if uniform",
-    ]
-    counted = next(iter(found.values()))["trajectories"]
-    text = (
-        f"Of the first {counted} trajectories that come back to a place; entropy in units of that of uniform "
-        "attention; a revisit is another visit of the same place, in the past or the future."
-    )
-    return text + "\n\n" + markdown(header, (cells(row, entry) for row, entry in found.items()))
 
 
 def _trainings(trainings: dict[str, Any]) -> str:

@@ -70,7 +70,6 @@ def result() -> dict[str, object]:
         "paired": {"perfect": tables.paired_json(TABLE, 8, WORLD)},
         "local_bias_deg": {"perfect": {"mean": -0.0012, "ci95": [-0.002, 0.0001]}},
         "path_m": {"perfect": {"4": 10.0, "8": 20.0}},
-        "attention": {},
         "trainings": {"ngo_5-seed0": {"command": "python -m x", "seconds": 90.0, "datapoints_per_s": 12.5}},
     }
 

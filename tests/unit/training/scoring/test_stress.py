@@ -11,9 +11,9 @@ from ngo_estimator.geometry.planar_motion import all_between, compose
 from training.data.lidar_drives import Relations
 from training.results_stress import tables_with_earlier
 from training.scoring import stress_cells
-from training.scoring.lidar_bars import stress_bars
 from training.scoring.lidar_rows import DriveRuns, Estimate, Row
 from training.scoring.second_visit import second_visit
+from training.scoring.stress_bars import stress_bars
 from training.scoring.stress_cells import StressLog, cell_numbers, cell_of
 from training.scoring.stress_rows import last_loop_error_m, wrong_joins
 
