@@ -4,8 +4,10 @@
     python -m training.results --world camera
     python -m training.results --world camera --named take_cover MAP27
     python -m training.results --world camera --split validation --without corrector
+    python -m training.results --world camera --places rooms --seeds 3 --frames 600
 
-A drive of the explorer on each map. The motion given is that of wheels with errors (``given_motion``). The command
+A drive of the explorer on each map, or rounds in rooms of another renderer (``room_drives``). The motion given is that
+of wheels with errors (``given_motion``). The command
 prints a table and writes ``training/results/camera.json``: each drive, and rows with means over drives. Run it again to
 continue after a stop. Drives of as many frames that are published and that the code of today has not measured stay, and
 name their revision.
@@ -26,7 +28,9 @@ from ngo_estimator.slam import picture_trajectory
 from ngo_sim import episodes, maze3d
 from training.common import records
 from training.common.command_line import check_at_least, run_command
+from training.data import room_drives
 from training.data.doom_drives import TEST_MAPS, VALIDATION_MAPS
+from training.data.room_drives import room_drive
 from training.report.folders import with_earlier
 from training.scoring import camera_rows
 from training.scoring.camera_rows import Ablation, camera_drive, measured
@@ -37,6 +41,7 @@ _FIRST_SEED = {"validation": 10_000, "test": 20_000}
 _Drives = dict[str, dict[str, Any]]
 """By the drive's name its numbers; ``revision`` where an older one measured them."""
 
+_ROOM_CODE = (room_drives,)
 _DRIVE_CODE, _ROW_CODE = (episodes, maze3d), (camera_rows, picture_odometry, picture_trajectory)
 
 
@@ -44,8 +49,9 @@ _DRIVE_CODE, _ROW_CODE = (episodes, maze3d), (camera_rows, picture_odometry, pic
 class Arguments:
     """Settings of the measurement."""
 
+    places: Literal["doom", "rooms"] = "doom"  # ViZDoom's maps, or rooms of another renderer, in a file of their own.
     split: Literal["validation", "test"] = "test"  # Maps to measure on; settings are chosen on validation.
-    seeds: int = 1  # Drives of each map.
+    seeds: int = 1  # Drives of each map, or rooms.
     frames: int = 1000  # Frames of a drive.
     maps: int = 0  # Number of maps; 0: all.
     without: Ablation = "nothing"  # An ablation, in a file of its own.
@@ -67,12 +73,13 @@ def main(arguments: Arguments) -> dict[str, Any]:
         raise ValueError(
             f"named is {', '.join(arguments.named)}; expected among {', '.join(of.name for of, _ in plan)}"
         )
-    measure(asked, folder, f"camera {arguments.split}")
+    measure(asked, folder, f"camera {arguments.places} {arguments.split}")
     known = {name: of[arguments.without] for name, of in measure(plan, folder, known_only=True).items() if of}
     drives: _Drives = {name: {key: float(value[0]) for key, value in of.errors.items()} for name, of in known.items()}
     split = "" if arguments.split == "test" else f".{arguments.split}"
     ablation = "" if arguments.without == "nothing" else f".no_{arguments.without}"
-    path = arguments.results / f"camera{split}{ablation}.json"
+    places = "" if arguments.places == "doom" else f".{arguments.places}"
+    path = arguments.results / f"camera{places}{split}{ablation}.json"
     published = json.loads(path.read_text()) if path.is_file() else None
     if published is not None and published["arguments"]["frames"] == arguments.frames:
         drives = with_earlier(drives, published["drives"], published["revision"])
@@ -82,7 +89,7 @@ def main(arguments: Arguments) -> dict[str, Any]:
         "graph": asdict(PictureGraphConfig()),
         "drives": drives,
         "median": _medians(list(drives.values())),
-        "tables": {"doom": _rows(list(drives.values()))},
+        "tables": {arguments.places: _rows(list(drives.values()))},
     }
     records.write_at_once(path, json.dumps(result, indent=1, default=str) + "\n")
     for name, numbers in {**drives, f"median, {len(drives)} drives": result["median"]}.items():
@@ -93,8 +100,14 @@ def main(arguments: Arguments) -> dict[str, Any]:
 def _drives(arguments: Arguments) -> list[Drive]:
     drives = []
     first, frames = _FIRST_SEED[arguments.split], arguments.frames
+    seeds = range(first, first + arguments.seeds)
+    if arguments.places == "rooms":
+        return [
+            Drive(f"room {seed}", f"room {seed}, {frames} frames", partial(room_drive, seed, frames), _ROOM_CODE)
+            for seed in seeds
+        ]
     for number, of in enumerate(_MAPS[arguments.split][: arguments.maps or None]):
-        for seed in range(first, first + arguments.seeds):
+        for seed in seeds:
             name = f"{of[0].removesuffix('.wad')} {of[1]} {seed}"
             make = partial(camera_drive, of, seed, frames, wheels_seed=seed + 100 * number)
             drives.append(Drive(name, f"{name}, {frames} frames, wheels {seed + 100 * number}", make, _DRIVE_CODE))

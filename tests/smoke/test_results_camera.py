@@ -1,6 +1,7 @@
 """The table of a calibrated camera at toy size: every number is there, in the file as in the result."""
 
 import json
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -65,6 +66,23 @@ def test_a_short_drive_on_a_map(tmp_path: Path, monkeypatch: pytest.MonkeyPatch)
         0.5 * (drive["corrected_ate_m"] + other["corrected_ate_m"])
     )
     assert json.loads((tmp_path / "camera.json").read_text())["median"] == result["median"]
+
+
+def test_rooms_of_another_renderer_ask_for_it_in_one_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "pybullet", None)
+    arguments = results_camera.Arguments(places="rooms", frames=24, results=tmp_path, runs=tmp_path / "runs")
+    with pytest.raises(ValueError, match=r"^pybullet is not installed; expected .* before$"):
+        results_camera.main(arguments)
+
+
+def test_a_short_drive_through_a_room(tmp_path: Path) -> None:
+    pytest.importorskip("pybullet", reason="another renderer, which is no requirement")
+    arguments = results_camera.Arguments(places="rooms", frames=24, results=tmp_path, runs=tmp_path / "runs")
+    result = results_camera.main(arguments)
+    assert [path.name for path in tmp_path.glob("*.json")] == ["camera.rooms.json"]
+    (drive,) = result["drives"].values()
+    assert drive["path_m"] == pytest.approx(23 * 0.07, rel=0.05) and drive["by_wheels"] == 0.0
+    assert result["tables"]["rooms"]["odometry"]["ate_m"]["mean"] == drive["odometry_ate_m"] < drive["given_ate_m"]
 
 
 def test_a_restricted_command_keeps_the_published_drives_that_it_does_not_measure(
