@@ -6,7 +6,6 @@ import math
 from collections.abc import Callable
 
 import numpy as np
-import numpy.typing as npt
 from numba import njit
 
 from ngo_sim.building_drivers import TURN_RPS2, BuildingDriverConfig, arc_end
@@ -67,21 +66,7 @@ class CommandedDriver:
         return 1.0
 
     def _gap(self, pose_xyyaw: Floats, leaves: Floats) -> float:
-        world = self._world
-        return float(
-            _nearest(
-                pose_xyyaw[0],
-                pose_xyyaw[1],
-                world.segments_m,
-                world.circles_m,
-                leaves,
-                world.low_m,
-                world.columns,
-                world.rows,
-                world.starts,
-                world.items,
-            )
-        )
+        return float(_nearest(pose_xyyaw[0], pose_xyyaw[1], self._world, leaves))
 
 
 @njit(cache=True)
@@ -94,26 +79,16 @@ def _to_segment(x: float, y: float, segment: Floats) -> float:
 
 
 @njit(cache=True)
-def _nearest(
-    x: float,
-    y: float,
-    segments: Floats,
-    circles: Floats,
-    leaves: Floats,
-    low: Floats,
-    columns: int,
-    rows: int,
-    starts: npt.NDArray[np.int64],
-    items: npt.NDArray[np.int64],
-) -> float:
+def _nearest(x: float, y: float, world: RayWorld, leaves: Floats) -> float:
     """Distance to the nearest thing in this cell and those around it, infinite where there is none."""
+    segments, circles, columns, low = world.segments_m, world.circles_m, world.columns, world.low_m
     col, row = int(np.floor((x - low[0]) / CELL_M)), int(np.floor((y - low[1]) / CELL_M))
     best = np.inf
-    for r in range(max(0, row - 1), min(rows, row + 2)):
+    for r in range(max(0, row - 1), min(world.rows, row + 2)):
         for c in range(max(0, col - 1), min(columns, col + 2)):
             cell = r * columns + c
-            for k in range(starts[cell], starts[cell + 1]):
-                index = items[k]
+            for k in range(world.starts[cell], world.starts[cell + 1]):
+                index = world.items[k]
                 if index < len(segments):
                     best = min(best, _to_segment(x, y, segments[index]))
                 elif index < len(segments) + len(circles):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -128,8 +129,7 @@ def draw_scanner(rng: np.random.Generator) -> ScannerConfig:
     )
 
 
-@dataclass(frozen=True, eq=False)
-class RayWorld:
+class RayWorld(NamedTuple):
     """Segments (n, 4) with glass (n,), circles (m, 3), and where door leaves may be, sorted into cells.
 
     Cell (row, col) holds items[starts[row * columns + col] : starts[row * columns + col + 1]]. Items below n are
@@ -144,6 +144,20 @@ class RayWorld:
     rows: int
     starts: Ints
     items: Ints
+
+
+class _Errors(NamedTuple):
+    """The fields of a scanner that make ranges of distances, as compiled code takes them."""
+
+    range_min_m: float
+    range_max_m: float
+    noise_m: float
+    noise_per_m: float
+    dropout: float
+    resolution_m: float
+    glass_seen: float
+    glass_lost: float
+    no_return_m: float
 
 
 def ray_world(segments_m: Floats, glass: Bools, circles_m: Floats, door_circles_m: Floats) -> RayWorld:
@@ -161,18 +175,10 @@ def ray_world(segments_m: Floats, glass: Bools, circles_m: Floats, door_circles_
         raise ValueError("the world is empty; it must have at least one segment or circle")
     low = points.min(axis=0) - CELL_M
     columns, rows = (np.ceil((points.max(axis=0) + CELL_M - low) / CELL_M)).astype(int).tolist()
+    segments, circles = np.ascontiguousarray(segments_m), np.ascontiguousarray(circles_m)
     discs = np.concatenate((circles_m, door_circles_m))
-    starts, items = _fill_cells(np.ascontiguousarray(segments_m), discs, low, columns, rows)
-    return RayWorld(
-        np.ascontiguousarray(segments_m),
-        np.ascontiguousarray(glass),
-        np.ascontiguousarray(circles_m),
-        low,
-        columns,
-        rows,
-        starts,
-        items,
-    )
+    starts, items = _fill_cells(segments, discs, low, columns, rows)
+    return RayWorld(segments, np.ascontiguousarray(glass), circles, low, columns, rows, starts, items)
 
 
 @njit(cache=True)
@@ -241,23 +247,14 @@ def _to_circle(x: float, y: float, ux: float, uy: float, circle: Floats) -> floa
 
 
 @njit(cache=True)
-def cast_ray(
+def _cast_ray(
     x: float,
     y: float,
     yaw: float,
-    reach: float,
-    segments: Floats,
-    glass: Bools,
-    circles: Floats,
+    world: RayWorld,
     leaves: Floats,
     moving: Floats,
-    low: Floats,
-    columns: int,
-    rows: int,
-    starts: Ints,
-    items: Ints,
-    glass_seen: float,
-    glass_lost: float,
+    errors: _Errors,
     rng: np.random.Generator,
 ) -> float:
     """Range of one ray from x, y along yaw, infinite where nothing is within reach.
@@ -266,7 +263,8 @@ def cast_ray(
     (Amanatides and Woo, 1987), and the visit ends with the first cell that holds a hit.
     """
     ux, uy = np.cos(yaw), np.sin(yaw)
-    best = reach
+    segments, circles, low, columns, rows = world.segments_m, world.circles_m, world.low_m, world.columns, world.rows
+    best = reach = errors.range_max_m
     for index in range(len(moving)):
         best = min(best, _to_circle(x, y, ux, uy, moving[index]))
     # How this ray meets glass is drawn once, at the first pane: -1 is not drawn.
@@ -293,18 +291,18 @@ def cast_ray(
     next_row = enter + ((row + 1 - cell_y) if uy > 0 else (cell_y - row)) * per_row if uy != 0.0 else np.inf
     while 0 <= col < columns and 0 <= row < rows:
         cell = row * columns + col
-        for k in range(starts[cell], starts[cell + 1]):
-            index = items[k]
+        for k in range(world.starts[cell], world.starts[cell + 1]):
+            index = world.items[k]
             if index < len(segments):
                 distance, cosine = _to_segment(x, y, ux, uy, segments[index])
                 if distance >= best:
                     continue
-                if glass[index] and cosine < _GLASS_SHINES_COS:
+                if world.glass[index] and cosine < _GLASS_SHINES_COS:
                     if chance < 0.0:
                         chance = rng.random()
-                    if chance >= glass_seen + glass_lost:
+                    if chance >= errors.glass_seen + errors.glass_lost:
                         continue
-                    if chance >= glass_seen:
+                    if chance >= errors.glass_seen:
                         lost_at = min(lost_at, distance)
                         continue
                 best = distance
@@ -328,28 +326,13 @@ def cast_ray(
 def _cast(
     poses: Floats,
     twists: Floats,
+    world: RayWorld,
     leaves: Floats,
     moving: Floats,
     angles: Floats,
     laser_xy: Floats,
     time_step: float,
-    range_min: float,
-    range_max: float,
-    noise: float,
-    noise_per_m: float,
-    dropout: float,
-    resolution: float,
-    no_return: float,
-    segments: Floats,
-    glass: Bools,
-    circles: Floats,
-    low: Floats,
-    columns: int,
-    rows: int,
-    starts: Ints,
-    items: Ints,
-    glass_seen: float,
-    glass_lost: float,
+    errors: _Errors,
     rng: np.random.Generator,
 ) -> npt.NDArray[np.float32]:
     scans, rays = len(poses), len(angles)
@@ -368,34 +351,17 @@ def _cast(
                 eye_x = x + ahead * np.cos(yaw + turn / 2) + cos * laser_xy[0] - sin * laser_xy[1]
                 eye_y = y + ahead * np.sin(yaw + turn / 2) + sin * laser_xy[0] + cos * laser_xy[1]
             distance = np.inf
-            if dropout == 0.0 or rng.random() >= dropout:
-                distance = cast_ray(
-                    eye_x,
-                    eye_y,
-                    heading + angles[ray],
-                    range_max,
-                    segments,
-                    glass,
-                    circles,
-                    leaves[scan],
-                    moving[scan],
-                    low,
-                    columns,
-                    rows,
-                    starts,
-                    items,
-                    glass_seen,
-                    glass_lost,
-                    rng,
-                )
+            if errors.dropout == 0.0 or rng.random() >= errors.dropout:
+                yaw = heading + angles[ray]
+                distance = _cast_ray(eye_x, eye_y, yaw, world, leaves[scan], moving[scan], errors, rng)
             if distance < np.inf:
-                deviation = noise + noise_per_m * distance
+                deviation = errors.noise_m + errors.noise_per_m * distance
                 if deviation > 0.0:
                     distance += deviation * rng.standard_normal()
-                if resolution > 0.0:
-                    distance = resolution * np.round(distance / resolution)
-            good = max(range_min, 1e-6) <= distance <= range_max
-            ranges[scan, ray] = distance if good else no_return
+                if errors.resolution_m > 0.0:
+                    distance = errors.resolution_m * np.round(distance / errors.resolution_m)
+            good = max(errors.range_min_m, 1e-6) <= distance <= errors.range_max_m
+            ranges[scan, ray] = distance if good else errors.no_return_m
     return ranges
 
 
@@ -414,32 +380,8 @@ def cast_scans(
     (scans, p, 3) moving circles; all stand still during a scan. rng: of noise, dropouts and glass; scans one by one
     draw the same as all at once.
     """
-    return np.asarray(
-        _cast(
-            np.ascontiguousarray(poses_xyyaw),
-            np.ascontiguousarray(twists),
-            np.ascontiguousarray(leaves_m),
-            np.ascontiguousarray(moving_m),
-            scanner.base_angles_rad(),
-            np.array((scanner.laser_x_m, scanner.laser_y_m)),
-            scanner.time_increment_s,
-            scanner.range_min_m,
-            scanner.range_max_m,
-            scanner.noise_m,
-            scanner.noise_per_m,
-            scanner.dropout,
-            scanner.resolution_m,
-            scanner.no_return_m,
-            world.segments_m,
-            world.glass,
-            world.circles_m,
-            world.low_m,
-            world.columns,
-            world.rows,
-            world.starts,
-            world.items,
-            scanner.glass_seen,
-            scanner.glass_lost,
-            rng,
-        )
-    )
+    errors = _Errors(*(float(getattr(scanner, name)) for name in _Errors._fields))
+    poses, moved, doors, people = map(np.ascontiguousarray, (poses_xyyaw, twists, leaves_m, moving_m))
+    laser_xy, angles = np.array((scanner.laser_x_m, scanner.laser_y_m)), scanner.base_angles_rad()
+    step_s = float(scanner.time_increment_s)
+    return np.asarray(_cast(poses, moved, world, doors, people, angles, laser_xy, step_s, errors, rng))
