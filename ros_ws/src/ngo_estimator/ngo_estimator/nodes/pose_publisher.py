@@ -29,8 +29,9 @@ class PosePublisher:
         settings: Callable[[], NgoNodeSettings],
         smoothing: "SmoothedCorrection",
         built: ExitStack,
+        namespace: str = "",
     ) -> None:
-        """Make the publishers, which end with ``built``; ``smoothing`` may be replaced."""
+        """Make the publishers, which end with ``built``; ``smoothing`` may be replaced. ``namespace`` ends in /."""
         self._settings, self.smoothing = settings, smoothing
 
         def publisher(message_type: type, topic: str) -> LifecyclePublisher:
@@ -38,11 +39,11 @@ class PosePublisher:
             built.callback(node.destroy_lifecycle_publisher, made)
             return made
 
-        topics = settings()
-        self._pose = publisher(PoseWithCovarianceStamped, topics.pose_topic)
-        self._tf = publisher(TFMessage, topics.tf_topic) if topics.publish_tf else None
-        self._odom_frame = topics.framed(topics.odom_frame)
-        self.use_map(topics.framed(topics.map_frame))
+        now = settings()
+        self._pose = publisher(PoseWithCovarianceStamped, f"{namespace}ngo/pose")
+        self._tf = publisher(TFMessage, now.tf_topic) if now.publish_tf else None
+        self._odom_frame = now.framed(now.odom_frame)
+        self.use_map(now.framed(now.map_frame))
 
     def use_map(self, frame: str) -> None:
         """Publish in another map's frame from now on."""
