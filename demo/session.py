@@ -65,12 +65,18 @@ class SessionConfig:
     def estimators(self, out: Path) -> list[NodeSpec]:
         """The estimator nodes, which may write below ``out``; images come reliably: a demo must not depend on luck."""
         weights = {} if self.weights is None else {"weights": str(self.weights.resolve())}
-        local = {"image_reliability": "reliable", "image_depth": 100}
+        window = {"window_frames": max(2000, self.frames), "relative_pose_depth": max(2000, self.frames)}
+        local = {
+            "image_reliability": "reliable",
+            "image_depth": 100,
+            "relative_pose_depth": window["relative_pose_depth"],
+        }
+        depth = {"relative_pose_depth": window["relative_pose_depth"]}
         writes = {"map_update_interval": MAP_INTERVAL_S, "save_directory": str(out.absolute())}
         # At some hundred frames a second a path is out of the usual queue before a busy recorder has it.
         kept = {f"qos_overrides./ngo/{name}.publisher.depth": 100 for name in ("path", "trajectory")}
-        corrected = {"path_rate_hz": 0.0, "window_frames": max(2000, self.frames), **kept}
-        mapper = {"world": self.world, **writes, **weights}
+        corrected = {"path_rate_hz": 0.0, **window, **kept}
+        mapper = {"world": self.world, **writes, **depth, **weights}
         return [
             # A path after every frame, for the latency.
             NodeSpec("ngo_estimator", "ngo_node", {"world": self.world, **corrected, **weights}),

@@ -32,7 +32,7 @@ def node() -> Iterator[Node]:
 @pytest.mark.parametrize(("at_once", "expected"), [(1, [1, 1, 1, 1, 1, 1]), (4, [4, 2])])
 def test_messages_that_wait_are_taken_together(node: Node, at_once: int, expected: list[int]) -> None:
     taken: list[int] = []
-    status = NodeStatus(node, 1000.0, dict)
+    status = NodeStatus(node, "diagnostics", 1000.0, dict)
     listening = Listening(node, status, 10.0)
     listening.to(Header, "header", lambda message: taken.append(message.stamp.sec), QoSProfile(depth=10), None, at_once)
     publisher = node.create_publisher(Header, "header", 10)

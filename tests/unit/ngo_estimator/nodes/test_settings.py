@@ -37,9 +37,16 @@ def test_the_file_lists_every_parameter_with_its_default_and_description(name: s
         ({"robots": ["red", "red"]}, "list of different names"),
         ({"robots": ["1st"]}, "list of different names"),
         ({"robots": ["red"], "state": "monday"}, "with a state"),
+        (
+            {"robots": ["red"], "relative_pose_topic": "~/steps"},
+            "'relative_pose_topic' is '~/steps'; allowed: a name without ~",
+        ),
+        ({"robots": ["red"], "trajectory_topic": "~/whole"}, "without ~ in front, with robots"),
     ],
 )
-def test_robots_have_different_names_and_no_saved_state(given: dict[str, object], says: str) -> None:
+def test_robots_have_different_names_topics_in_their_namespaces_and_no_saved_state(
+    given: dict[str, object], says: str
+) -> None:
     for kind in (NgoNodeSettings, MapNodeSettings):
         with pytest.raises(BadParameter, match=says):
             make_settings(kind, given)
@@ -53,11 +60,13 @@ def test_every_file_is_accepted_in_any_namespace(path: Path) -> None:
             make_settings(KINDS[node], content["ros__parameters"])
 
 
-def test_frames_that_would_coincide_are_errors() -> None:
+def test_frames_that_would_coincide_and_a_short_queue_are_errors() -> None:
     with pytest.raises(BadParameter, match="another name than odom_frame's"):
         LocalNodeSettings(base_frame="odom")
     with pytest.raises(BadParameter, match="another name than odom_frame's"):
         NgoNodeSettings(map_frame="odom")
+    with pytest.raises(BadParameter, match="at least window_frames, which is 3000"):
+        NgoNodeSettings(window_frames=3000)
 
 
 def test_a_saved_map_learns_in_localization_alone() -> None:

@@ -80,7 +80,9 @@ class CameraInput:
         for topic in self._info_topics:
             listening.to_all(CameraInfo, topic, partial(self._on_info, topic), pictures)
         self._robot.listen(listening, status)
-        self._points = self._node.create_publisher(PointCloud2, "points", _DEPTH, qos_overriding_options=overridable())
+        self._points = self._node.create_publisher(
+            PointCloud2, settings.points_topic, _DEPTH, qos_overriding_options=overridable()
+        )
 
     def _on_info(self, topic: str, message: CameraInfo) -> None:
         arrays = (np.asarray(values, np.float64).tobytes() for values in (message.k, message.p, message.d))

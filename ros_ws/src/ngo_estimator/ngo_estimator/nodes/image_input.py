@@ -55,8 +55,9 @@ class ImageInput:
         self._pairing = FramePairing(
             self._core.uses_action,
             int(settings.action_timeout_s * 1e9),
-            needs_twist=self._core.uses_twist,
-            twist_tolerance_ns=int(settings.twist_tolerance_s * 1e9),
+            settings.action_capacity,
+            self._core.uses_twist,
+            int(settings.twist_tolerance_s * 1e9),
         )
         self._sensor_and_side: tuple[Input, list[Input]] | None = None
         self._taking = False
@@ -80,7 +81,7 @@ class ImageInput:
         sensor = listening.to(self._sensor_type, self._sensor_topic, self._on_sensor, image_qos)
         side, qos = [], QoSProfile(depth=_DEPTH)
         if self._core.uses_action:
-            side.append(listening.to(DiscreteAction, "action", self._on_action, qos))
+            side.append(listening.to(DiscreteAction, settings.action_topic, self._on_action, qos))
         if self._core.uses_twist:
             side.append(listening.to(_TWISTS[settings.twist_type], settings.twist_topic, self._on_twist, qos))
         self._sensor_and_side = sensor, side
@@ -133,7 +134,7 @@ class ImageInput:
             self._run(pairs[:AT_ONCE])
             del pairs[:AT_ONCE]
         if self._pairing.dropped > dropped:
-            controls = ["action on 'action'"] if self._core.uses_action else []
+            controls = [f"action on '{self._settings.action_topic}'"] if self._core.uses_action else []
             controls += [f"velocity on '{self._settings.twist_topic}'"] if self._core.uses_twist else []
             kind = f"{self._sensor} without {'action' if self._core.uses_action else 'velocity'}"
             reason = f"the {' or the '.join(controls)} that led to it did not come"

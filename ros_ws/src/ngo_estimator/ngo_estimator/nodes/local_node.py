@@ -22,7 +22,7 @@ from ngo_estimator.data.lidar_file import is_lidar, require_opencv, require_torc
 from ngo_estimator.geometry.planar_covariance import position_std, propagate
 from ngo_estimator.nodes import messages
 from ngo_estimator.nodes.listening import Listening
-from ngo_estimator.nodes.settings import RELATIVE_POSES, STEPS, LocalNodeSettings
+from ngo_estimator.nodes.settings import LocalNodeSettings
 from ngo_estimator.nodes.status import NodeStatus
 from ngo_estimator.nodes.step_messages import OdometryWriter, TransformsWriter
 from ngo_estimator.nodes.weights import weights_folder
@@ -81,11 +81,13 @@ class LocalNode(Node):
 
     def _create_topics(self) -> None:
         settings = self._settings
-        self._status = NodeStatus(self, settings.diagnostics_period_s, self._details, self._problems)
-        self._relative_pose = self._publisher(RelativePose, RELATIVE_POSES, STEPS)
+        self._status = NodeStatus(
+            self, settings.diagnostics_topic, settings.diagnostics_period_s, self._details, self._problems
+        )
+        self._relative_pose = self._publisher(RelativePose, settings.relative_pose_topic, settings.relative_pose_depth)
         odom_frame, base_frame = settings.framed(settings.odom_frame), settings.framed(settings.base_frame)
         if settings.publish_odometry and not self._has_odom:
-            self._odometry = self._publisher(Odometry, "odom")
+            self._odometry = self._publisher(Odometry, settings.odometry_topic)
             self._odometry_writer = OdometryWriter(odom_frame, base_frame, serialize_message)
         if settings.publish_tf and not self._has_odom:
             self._tf = self._publisher(TFMessage, settings.tf_topic)

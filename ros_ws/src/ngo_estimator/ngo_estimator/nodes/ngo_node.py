@@ -11,6 +11,7 @@ from geometry_msgs.msg import PoseWithCovarianceStamped
 from ngo_msgs.msg import RelativePose
 from ngo_msgs.srv import RemoveLoop, Reset
 from rclpy.clock import Clock, ClockType
+from rclpy.qos import QoSProfile
 from std_srvs.srv import SetBool
 
 from ngo_common.nodes.parameters import LiveSettings
@@ -21,13 +22,13 @@ from ngo_estimator.geometry.planar_covariance import position_std
 from ngo_estimator.nodes import messages
 from ngo_estimator.nodes.code_memory import release_code
 from ngo_estimator.nodes.file_services import StateServices
-from ngo_estimator.nodes.inputs import Input, relative_poses
+from ngo_estimator.nodes.inputs import Input
 from ngo_estimator.nodes.loop_removal import remove_loops
 from ngo_estimator.nodes.managed_node import ManagedNode
 from ngo_estimator.nodes.pose_publisher import PosePublisher
 from ngo_estimator.nodes.pose_search import PoseSearch
 from ngo_estimator.nodes.robot_fleet import RobotFleet
-from ngo_estimator.nodes.settings import RELATIVE_POSES, NgoNodeSettings
+from ngo_estimator.nodes.settings import NgoNodeSettings
 from ngo_estimator.nodes.status import NodeStatus
 from ngo_estimator.nodes.trajectory_publishers import TrajectoryPublishers
 from ngo_estimator.nodes.trajectory_report import TrajectoryReport
@@ -45,6 +46,8 @@ if TYPE_CHECKING:
 
 NAME = "ngo_node"
 _DEPTH = 100
+_SERVICES = QoSProfile(depth=1000)  # every call is answered, many at once as well
+_AT_ONCE = 8  # relative poses that are taken where the node fell behind
 _PENDING_S = 1.0
 _SEARCH_LINE_S = 10.0
 _STARTS = 80  # relative poses until compiled functions are loaded
@@ -109,21 +112,32 @@ class NgoNode(ManagedNode):
         self._begin_anew()
         self._configured = True
         built.callback(setattr, self, "_configured", False)
-        self._files = files = StateServices(self, settings, self._trajectories, self._graph, self._session, self._take)
+        self._files = files = StateServices(
+            self,
+            settings,
+            self._trajectories,
+            self._graph,
+            self._session,
+            self._take,
+        )
         if settings.state:
             try:
                 files.load_at_start(settings.state, settings.relocalises)
             except ValueError as error:
                 raise StartError(f"state: {error}") from error
-        files.open(
-            built,
+        files.open(_SERVICES, built)
+        for kind, name, callback in (
             (Reset, "~/reset", self._on_reset),
             (SetBool, "~/pause", self._on_pause),
             (RemoveLoop, "~/remove_loop", self._on_remove_loop),
-        )
+        ):
+            service = self.create_service(kind, name, callback, qos_profile=_SERVICES)
+            built.callback(self.destroy_service, service)
 
     def _create_outputs(self, settings: NgoNodeSettings, smoothing: "SmoothedCorrection") -> None:
-        self._status = NodeStatus(self, settings.diagnostics_period_s, self._details, self._problems)
+        self._status = NodeStatus(
+            self, settings.diagnostics_topic, settings.diagnostics_period_s, self._details, self._problems
+        )
         self._status.idle = "inactive"
         self._built.callback(self._status.close)
         self._out = PosePublisher(self, lambda: self._settings, smoothing, self._built)
@@ -136,11 +150,21 @@ class NgoNode(ManagedNode):
             self._fleet.listen(listening)
             return
         with checked_overrides():
-            steps = relative_poses(self, self._status, settings, RELATIVE_POSES, self._on_relative_pose)
+            steps = Input(
+                self,
+                self._status,
+                RelativePose,
+                settings.relative_pose_topic,
+                settings.relative_pose_depth,
+                self._on_relative_pose,
+                lambda message: messages.to_ns(message.origin_stamp),
+                settings.source_timeout_s,
+                at_once=_AT_ONCE,
+            )
             listening.callback(steps.close)
             initial = self.create_subscription(
                 PoseWithCovarianceStamped,
-                "initialpose",
+                settings.initial_pose_topic,
                 self._on_initial_pose,
                 _DEPTH,
                 qos_overriding_options=overridable(),
@@ -158,7 +182,7 @@ class NgoNode(ManagedNode):
         listening.callback(setattr, self._status, "idle", "inactive")
         self._starts = _STARTS
         release_code()
-        name, topic = self.get_fully_qualified_name(), self.resolve_topic_name(RELATIVE_POSES)
+        name, topic = self.get_fully_qualified_name(), self.resolve_topic_name(settings.relative_pose_topic)
         self.get_logger().info(f"ready: {name}, {settings.world}, the last {settings.window_frames} of '{topic}'")
 
     def _session(self) -> "Session":

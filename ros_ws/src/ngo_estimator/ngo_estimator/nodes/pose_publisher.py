@@ -29,9 +29,8 @@ class PosePublisher:
         settings: Callable[[], NgoNodeSettings],
         smoothing: "SmoothedCorrection",
         built: ExitStack,
-        namespace: str = "",
     ) -> None:
-        """Make the publishers, which end with ``built``; ``smoothing`` may be replaced. ``namespace`` ends in /."""
+        """Make the publishers, which end with ``built``; ``smoothing`` may be replaced."""
         self._settings, self.smoothing = settings, smoothing
 
         def publisher(message_type: type, topic: str) -> LifecyclePublisher:
@@ -39,11 +38,11 @@ class PosePublisher:
             built.callback(node.destroy_lifecycle_publisher, made)
             return made
 
-        now = settings()
-        self._pose = publisher(PoseWithCovarianceStamped, f"{namespace}ngo/pose")
-        self._tf = publisher(TFMessage, now.tf_topic) if now.publish_tf else None
-        self._odom_frame = now.framed(now.odom_frame)
-        self.use_map(now.framed(now.map_frame))
+        topics = settings()
+        self._pose = publisher(PoseWithCovarianceStamped, topics.pose_topic)
+        self._tf = publisher(TFMessage, topics.tf_topic) if topics.publish_tf else None
+        self._odom_frame = topics.framed(topics.odom_frame)
+        self.use_map(topics.framed(topics.map_frame))
 
     def use_map(self, frame: str) -> None:
         """Publish in another map's frame from now on."""

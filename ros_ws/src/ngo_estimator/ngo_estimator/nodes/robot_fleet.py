@@ -4,13 +4,14 @@ import traceback
 from contextlib import ExitStack
 from dataclasses import replace
 from functools import partial
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from ngo_msgs.msg import RelativePose
 from ngo_msgs.srv import RemoveLoop, Reset
 from rclpy.clock import Clock, ClockType
 from rclpy.lifecycle import LifecycleNode
+from rclpy.qos import QoSProfile
 from std_srvs.srv import SetBool
 
 from ngo_common.nodes.process import StartError
@@ -18,10 +19,10 @@ from ngo_common.nodes.qos import checked_overrides
 from ngo_estimator.geometry.planar_covariance import position_std
 from ngo_estimator.nodes import messages
 from ngo_estimator.nodes.file_services import FileServices
-from ngo_estimator.nodes.inputs import Input, relative_poses
+from ngo_estimator.nodes.inputs import Input
 from ngo_estimator.nodes.loop_removal import remove_loops
 from ngo_estimator.nodes.pose_publisher import PosePublisher
-from ngo_estimator.nodes.settings import RELATIVE_POSES, NgoNodeSettings
+from ngo_estimator.nodes.settings import TOPICS_OF_ROBOTS, NgoNodeSettings, of_robot
 from ngo_estimator.nodes.status import NodeStatus
 from ngo_estimator.nodes.trajectory_publishers import TrajectoryPublishers
 from ngo_estimator.nodes.weights import load_trajectory
@@ -33,6 +34,8 @@ if TYPE_CHECKING:  # torch takes seconds: a bad parameter is said at once
     from ngo_estimator.slam.trajectory_update import Trajectory
     from ngo_estimator.trajectory.g2o import PlanarGraph
 
+_SERVICES = QoSProfile(depth=1000)
+_AT_ONCE = 8  # relative poses of a robot that are taken where the node fell behind
 _PENDING_S = 1.0
 
 
@@ -46,14 +49,15 @@ class _Robot:
         self.newest: FleetUpdate | None = None
         self.odom_xyyaw: np.ndarray | None = None
         smoothing = SmoothedCorrection(fleet.settings.tf_smoothing_s)
-        self.out = PosePublisher(fleet.node, lambda: self.own_settings(fleet.settings), smoothing, built, f"{name}/")
-        own, count = self.own_settings(fleet.settings), len(fleet.settings.robots)
-        self.whole = TrajectoryPublishers(fleet.node, own, partial(fleet.trajectory, name), count, f"{name}/")
+        self.out = PosePublisher(fleet.node, lambda: self.own_settings(fleet.settings), smoothing, built)
+        own = self.own_settings(fleet.settings)
+        self.whole = TrajectoryPublishers(fleet.node, own, partial(fleet.trajectory, name), len(fleet.settings.robots))
         built.callback(self.whole.close)
 
     def own_settings(self, settings: NgoNodeSettings) -> NgoNodeSettings:
         """The settings of a node for this robot alone."""
-        return replace(settings, robots=(), frame_prefix=f"{self.name}/")
+        topics: dict[str, Any] = {topic: of_robot(self.name, getattr(settings, topic)) for topic in TOPICS_OF_ROBOTS}
+        return replace(settings, robots=(), frame_prefix=f"{self.name}/", **topics)
 
 
 class RobotFleet:
@@ -80,25 +84,38 @@ class RobotFleet:
         self._paused = False
         self._inputs: list[Input] = []
         with checked_overrides():
-            self._status = NodeStatus(node, settings.diagnostics_period_s, self._details, self._problems)
+            self._status = NodeStatus(
+                node, settings.diagnostics_topic, settings.diagnostics_period_s, self._details, self._problems
+            )
             built.callback(self._status.close)
             self._robots = {name: _Robot(self, name, built) for name in settings.robots}
         self._status.idle = "inactive"
         self._files = FileServices(node, settings, self._trajectories, self._graph)
-        self._files.open(
-            built,
+        self._files.open(_SERVICES, built)
+        for kind, name, callback in (
             (Reset, "~/reset", self._on_reset),
             (SetBool, "~/pause", self._on_pause),
             (RemoveLoop, "~/remove_loop", self._on_remove_loop),
-        )
+        ):
+            service = node.create_service(kind, name, callback, qos_profile=_SERVICES)
+            built.callback(node.destroy_service, service)
 
     def listen(self, listening: ExitStack) -> None:
         """Take relative poses until ``listening`` is closed."""
         settings = self.settings
         with checked_overrides():
             for robot in self._robots.values():
-                topic, take = f"{robot.name}/{RELATIVE_POSES}", partial(self._on_relative_pose, robot)
-                entry = relative_poses(self.node, self._status, settings, topic, take)
+                entry = Input(
+                    self.node,
+                    self._status,
+                    RelativePose,
+                    of_robot(robot.name, settings.relative_pose_topic),
+                    settings.relative_pose_depth,
+                    partial(self._on_relative_pose, robot),
+                    lambda message: messages.to_ns(message.origin_stamp),
+                    settings.source_timeout_s,
+                    at_once=_AT_ONCE,
+                )
                 listening.callback(entry.close)
                 self._inputs.append(entry)
         listening.callback(self._inputs.clear)

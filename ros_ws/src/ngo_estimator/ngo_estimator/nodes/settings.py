@@ -34,11 +34,20 @@ def _robots(description: str) -> tuple[str, ...]:
     return names
 
 
-RELATIVE_POSES, TRAJECTORY = "relative_pose", "ngo/trajectory"
-"""Topics between the nodes; ROS remaps them, as all others. With several robots each is in a robot's namespace."""
+TOPICS_OF_ROBOTS = ("relative_pose_topic", "pose_topic", "path_topic", "trajectory_topic", "loops_topic")
+"""Parameters with topics that each of several robots has in its namespace."""
 
-STEPS = 2000
-"""Queue of relative poses: a node that falls behind loses none of so many."""
+
+def _check_robots(settings: "NgoNodeSettings | MapNodeSettings") -> None:
+    """Raise ``BadParameter`` about a topic that cannot be in a robot's namespace."""
+    for name in TOPICS_OF_ROBOTS if settings.robots else ():
+        if (value := getattr(settings, name, "")).startswith("~"):
+            raise BadParameter(f"parameter '{name}' is '{value}'; allowed: a name without ~ in front, with robots")
+
+
+def of_robot(robot: str, topic_name: str) -> str:
+    """The name of a robot's topic: that of one robot alone, in the robot's namespace."""
+    return f"{robot}/{topic_name.removeprefix('/')}"
 
 
 @dataclass(frozen=True)
@@ -53,6 +62,10 @@ class StepSettings(FramedSettings):
         check=lambda value: re.fullmatch(r"[\w-]+", value) is not None,
     )
     weights: str = setting("", "Folder of weights for that world; empty: the ones that ship with the package.")
+    relative_pose_topic: str = topic("relative_pose", "Steps of the odometry, from local_node to ngo_node.")
+    relative_pose_depth: int = setting(
+        2000, "Queue of relative_pose_topic, at least ngo_node's window_frames.", minimum=1, maximum=100_000
+    )
     source_timeout_s: float = setting(
         1.0,
         "Silence of an input topic's publisher after which another publisher of the topic takes its place.",
@@ -60,6 +73,7 @@ class StepSettings(FramedSettings):
         maximum=3600.0,
         live=True,
     )
+    diagnostics_topic: str = topic("/diagnostics", "Rates, drops and durations of the node.")
     diagnostics_period_s: float = setting(1.0, "Time between diagnostics.", minimum=0.05, maximum=3600.0, live=True)
 
     @property
@@ -129,17 +143,27 @@ class LocalNodeSettings(EstimatorSettings):
         "IMU whose yaw rate stands in for the turns of the robot's odometry, with world:=scan, where it agrees better "
         "with the scans.",
     )
+    points_topic: str = topic(
+        "points", "Points that the newest picture's corners show, in base_frame, with world:=camera, for who listens."
+    )
     image_reliability: str = setting(
         "best_effort",
         "Reliability of image_topic or scan_topic; reliable: lost messages are sent again.",
         choices=("best_effort", "reliable"),
     )
     image_depth: int = setting(5, "Queue of image_topic or scan_topic.", minimum=1, maximum=10_000)
+    action_topic: str = topic("action", "Actions, stamped with the image at which they were taken.")
     action_timeout_s: float = setting(
         1.0,
         "Time after which an image without its action or velocity is dropped, by the stamps of newer images.",
         minimum=0.001,
         maximum=60.0,
+    )
+    action_capacity: int = setting(
+        64,
+        "Number of images that may wait for actions or velocities; then the oldest is dropped.",
+        minimum=1,
+        maximum=10_000,
     )
     twist_topic: str = topic("twist", "Velocities of the robot, with weights that take them.")
     twist_type: str = setting(
@@ -152,7 +176,8 @@ class LocalNodeSettings(EstimatorSettings):
         maximum=60.0,
     )
     base_frame: str = frame("base_link", "Frame of the robot.")
-    publish_odometry: bool = setting(True, "Whether to publish the odometry on odom.")
+    odometry_topic: str = topic("odom", "Pose in odom_frame with covariance, and velocity.")
+    publish_odometry: bool = setting(True, "Whether to publish odometry_topic.")
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -198,6 +223,9 @@ class NgoNodeSettings(EstimatorSettings):
         "Pose of a trajectory's first frame in map_frame; a change holds from the next trajectory on.",
         live=True,
     )
+    initial_pose_topic: str = topic(
+        "initialpose", "Current pose of the robot in map_frame; the whole trajectory moves there."
+    )
     save_directory: str = setting(
         "",
         "Folder in which services may write, and ~/load_state may read; empty: the working directory of the node.",
@@ -221,9 +249,16 @@ class NgoNodeSettings(EstimatorSettings):
         "sees enters the map and replaces what has changed; ~/save_state keeps it.",
         choices=("ignore", "learn"),
     )
+    path_topic: str = topic("ngo/path", "Corrected trajectory.")
+    pose_topic: str = topic("ngo/pose", "Corrected newest pose with covariance, after every relative pose.")
+    trajectory_topic: str = topic(
+        "ngo/trajectory", "Corrected trajectory in flat arrays, with the distance that each pose moved."
+    )
+    loops_topic: str = topic("ngo/loops", "Loop closures as lines between poses.")
     path_rate_hz: float = setting(
         10.0,
-        "Highest rate of ngo/path, ngo/trajectory and ngo/loops; 0: after every relative pose and every correction.",
+        "Highest rate of path_topic, trajectory_topic and loops_topic; 0: after every relative pose and every "
+        "correction.",
         minimum=0.0,
         maximum=1000.0,
         live=True,
@@ -255,6 +290,7 @@ class NgoNodeSettings(EstimatorSettings):
         super().__post_init__()
         if self.map_frame == self.odom_frame:
             raise BadParameter(f"parameter 'map_frame' is {self.map_frame!r}; allowed: another name than odom_frame's")
+        _check_robots(self)
         if self.robots and (self.mode != "mapping" or self.state):
             raise BadParameter(
                 f"parameter 'robots' is {list(self.robots)}; allowed: none with mode localization, or with a state"
@@ -266,6 +302,11 @@ class NgoNodeSettings(EstimatorSettings):
                 )
         if self.map_changes == "learn" and self.mode != "localization":
             raise BadParameter("parameter 'map_changes' is 'learn'; allowed: ignore, with mode mapping, which learns")
+        if self.relative_pose_depth < self.window_frames:
+            raise BadParameter(
+                f"parameter 'relative_pose_depth' is {self.relative_pose_depth}; "
+                f"allowed: at least window_frames, which is {self.window_frames}"
+            )
 
     @property
     def keeps_map(self) -> bool:
@@ -292,11 +333,13 @@ class MapNodeSettings(StepSettings):
     map_update_interval: float = setting(
         0.5, "Least time between two maps, s.", minimum=0.05, maximum=3600.0, live=True
     )
-    map_frame: str = frame("map", "Frame of the map, that of ngo/trajectory.")
+    map_frame: str = frame("map", "Frame of the map, that of trajectory_topic.")
     robots: tuple[str, ...] = _robots(
         "Namespaces of several robots, as ngo_node has them: the map shows what those in map_frame saw. Empty: one "
         "robot."
     )
+    trajectory_topic: str = topic("ngo/trajectory", "Corrected trajectory, from ngo_node.")
+    map_topic: str = topic("map", "Map; changes of a part of it go to a topic of this name with _updates behind it.")
     save_directory: str = setting(
         "",
         "Folder in which ~/save_map and ~/save_state may write, and ~/load_state may read; empty: the working "
@@ -306,5 +349,6 @@ class MapNodeSettings(StepSettings):
 
     def __post_init__(self) -> None:
         super().__post_init__()
+        _check_robots(self)
         if self.robots and self.state:
             raise BadParameter(f"parameter 'robots' is {list(self.robots)}; allowed: none with a state")

@@ -28,11 +28,12 @@ class NodeStatus:
     def __init__(
         self,
         node: Node,
+        topic: str,
         period_s: float,
         details: Callable[[], dict[str, str]],
         problems: Callable[[], list[str]] = list,
     ) -> None:
-        """Publish on ``/diagnostics`` each ``period_s``; ``details`` adds the node's own values, ``problems`` lines."""
+        """Publish on ``topic`` every ``period_s``; ``details`` adds the node's own values, ``problems`` lines."""
         self._node = node
         self._details, self._problems = details, problems
         self._name_watch = NameWatch(node)
@@ -44,8 +45,7 @@ class NodeStatus:
         self.idle = ""
         """Why no input is expected now; empty: input is expected."""
         self._start_period()
-        options = overridable()
-        self._publisher = node.create_publisher(DiagnosticArray, "/diagnostics", 10, qos_overriding_options=options)
+        self._publisher = node.create_publisher(DiagnosticArray, topic, 10, qos_overriding_options=overridable())
         self._timer = node.create_timer(period_s, self._publish, clock=Clock(clock_type=ClockType.STEADY_TIME))
 
     def close(self) -> None:

@@ -17,7 +17,7 @@ from ngo_common.nodes.qos import overridable
 from ngo_estimator.nodes.loop_message import LoopMarkerWriter
 from ngo_estimator.nodes.messages import trajectory_message
 from ngo_estimator.nodes.path_message import PathWriter
-from ngo_estimator.nodes.settings import TRAJECTORY, NgoNodeSettings
+from ngo_estimator.nodes.settings import NgoNodeSettings
 from ngo_estimator.slam.publication_pace import PublicationPace
 
 if TYPE_CHECKING:
@@ -39,15 +39,14 @@ class TrajectoryPublishers:
         settings: NgoNodeSettings,
         snapshot: Callable[[], "WholeTrajectory | None"],
         robots: int = 1,
-        namespace: str = "",
     ) -> None:
-        """Publish ``snapshot()``, that of one of so many ``robots``, on three topics; ``namespace`` ends in /."""
+        """Publish ``snapshot()`` on the three topics of ``settings``; it is that of one of so many ``robots``."""
         self._node, self._robots = node, robots
         self._snapshot = snapshot
         self.use_map(settings.framed(settings.map_frame))
-        self._path = self._create(Path, f"{namespace}ngo/path")
-        self._trajectory = self._create(Trajectory, f"{namespace}{TRAJECTORY}")
-        self._loops = self._create(MarkerArray, f"{namespace}ngo/loops")
+        self._path = self._create(Path, settings.path_topic)
+        self._trajectory = self._create(Trajectory, settings.trajectory_topic)
+        self._loops = self._create(MarkerArray, settings.loops_topic)
         self._outdated: set[LifecyclePublisher] = set()
         self.paths = 0
         """How many paths were published."""

@@ -19,7 +19,6 @@ from ngo_common.nodes.parameters import LiveSettings
 from ngo_common.nodes.process import StartError, run_node
 from ngo_common.settings import usage
 from ngo_estimator.nodes import messages
-from ngo_estimator.nodes.settings import TRAJECTORY
 from ngo_estimator.nodes.view_settings import ViewNodeSettings
 from ngo_recordings.association import ros_pose
 from ngo_recordings.images import COMPRESSED_TYPE, IMAGE_TYPE
@@ -73,15 +72,15 @@ class ViewNode(Node):
         if settings.image_transport == "compressed":
             picture_type, topic = CompressedImage, f"{topic}/compressed"
         for kind, name, callback, qos in (
-            (Odometry, "odom", self._pose_of("odometry"), _DEPTH),
-            (Odometry, "ground_truth", self._pose_of("truth"), _DEPTH),
+            (Odometry, settings.odometry_topic, self._pose_of("odometry"), _DEPTH),
+            (Odometry, settings.ground_truth_topic, self._pose_of("truth"), _DEPTH),
             (TFMessage, settings.tf_topic + "_static", self._on_static, static),
-            (Trajectory, TRAJECTORY, self._keep("trajectory"), 1),
-            (PoseWithCovarianceStamped, "ngo/pose", self._keep("pose"), newest),
-            (MarkerArray, "ngo/loops", self._keep("loops"), 1),
-            (MarkerArray, "explore/frontiers", self._keep("frontiers"), latched),
-            (Path, "explore/path", self._keep("plan"), newest),
-            (OccupancyGrid, "map", self._keep("map"), latched),
+            (Trajectory, settings.trajectory_topic, self._keep("trajectory"), 1),
+            (PoseWithCovarianceStamped, settings.pose_topic, self._keep("pose"), newest),
+            (MarkerArray, settings.loops_topic, self._keep("loops"), 1),
+            (MarkerArray, settings.frontiers_topic, self._keep("frontiers"), latched),
+            (Path, settings.plan_topic, self._keep("plan"), newest),
+            (OccupancyGrid, settings.map_topic, self._keep("map"), latched),
             (picture_type, topic, self._keep("picture"), newest),
             (LaserScan, settings.scan_topic, self._keep("scan"), newest),
         ):

@@ -25,6 +25,14 @@ class ViewNodeSettings(FramedSettings):
     )
     scan_topic: str = topic("scan", "Laser scans to show at the corrected pose.")
     tf_topic: str = topic("/tf", "Transforms; the mounting of the scanner comes from this name with _static.")
+    odometry_topic: str = topic("odom", "Odometry of the robot.")
+    ground_truth_topic: str = topic("ground_truth", "True poses, where something knows them.")
+    trajectory_topic: str = topic("ngo/trajectory", "Corrected trajectory.")
+    pose_topic: str = topic("ngo/pose", "Corrected newest pose with covariance.")
+    loops_topic: str = topic("ngo/loops", "Loop closures.")
+    frontiers_topic: str = topic("explore/frontiers", "What is left to explore.")
+    plan_topic: str = topic("explore/path", "Path that the robot means to drive; its end is shown as the goal.")
+    map_topic: str = topic("map", "Occupancy grid.")
 
     def __post_init__(self) -> None:
         super().__post_init__()

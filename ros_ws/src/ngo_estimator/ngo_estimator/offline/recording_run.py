@@ -22,7 +22,7 @@ class RecordingRun(Run):
 
     Args:
         local, online: the cores, which begin anew.
-        action_timeout_ns: as in ``FramePairing``.
+        action_timeout_ns, action_capacity: as in ``FramePairing``.
         scan_yaw_rad: where a scanner's angle 0 points, counter-clockwise from straight ahead.
     """
 
@@ -31,11 +31,12 @@ class RecordingRun(Run):
         local: LocalOdometry,
         online: OnlineTrajectory,
         action_timeout_ns: int = 1_000_000_000,
+        action_capacity: int = 64,
         scan_yaw_rad: float = 0.0,
     ) -> None:
         super().__init__(online, "frame")
         self._local, self._scan_yaw_rad = local, scan_yaw_rad
-        self._pairing = FramePairing(local.uses_action, action_timeout_ns, needs_twist=local.uses_twist)
+        self._pairing = FramePairing(local.uses_action, action_timeout_ns, action_capacity, local.uses_twist)
         self._unlikeness: list[float] = []
         self._repeated = 0
 

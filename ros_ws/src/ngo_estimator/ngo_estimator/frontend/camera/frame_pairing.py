@@ -41,7 +41,7 @@ class FramePairing:
         self,
         needs_action: bool,
         timeout_ns: int,
-        capacity: int = 64,
+        capacity: int,
         needs_twist: bool = False,
         twist_tolerance_ns: int = 500_000_000,
     ) -> None:
