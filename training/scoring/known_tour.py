@@ -63,8 +63,8 @@ def known_tour(world: ExploredWorld, known: KnownMap, start_xy: np.ndarray, need
     """Paths ``(n, 2)`` from place to place, in order; all that is asked for is seen at the end of the last."""
     scans, poses = world.exact_scans()
     field = cost_field(known, start_xy, need_m)
-    blocks = [np.array(known.cell(pose)) // known.block for pose in poses]
-    near = [number for number, (row, column) in enumerate(blocks) if field[row, column] >= 0]
+    rows, columns = known.cells(poses[:, :2]).T // known.block
+    near = np.flatnonzero(field[rows, columns] >= 0)
     points = np.concatenate((start_xy[None], poses[near, :2]))
     nearest = 1 + int(np.argmin(np.hypot(*(points[1:] - start_xy).T)))
     seen = _seen([scans[number].ends + poses[number, :2] for number in near], points[1:])

@@ -5,7 +5,7 @@ from itertools import permutations
 import numpy as np
 import pytest
 
-from ngo_explorer.frontiers import FrontierFinder, gain_m2
+from ngo_explorer.frontiers import FrontierFinder, gains_m2
 from ngo_explorer.known_map import KnownMap
 from ngo_explorer.planner import cost_field, line_is_free, plan_path
 from ngo_explorer.tours import tour
@@ -64,10 +64,10 @@ def test_a_frontier_across_the_grid_is_as_long_as_it_is() -> None:
 def test_gain_is_the_unknown_area_that_rays_reach() -> None:
     values = np.zeros((101, 101), np.int8)
     values[:, 51:] = -1
-    half_circle = gain_m2(known_of(values), np.array((5.05, 5.05)), 4.0)
+    half_circle = gains_m2(known_of(values), np.array(((5.05, 5.05),)), np.array((4.0,)))[0]
     assert half_circle == pytest.approx(0.5 * np.pi * 4.0**2, rel=0.05)
     values[:, 51] = 100
-    assert gain_m2(known_of(values), np.array((4.05, 5.05)), 3.0) == 0.0, "a wall hides it"
+    assert gains_m2(known_of(values), np.array(((4.05, 5.05),)), np.array((3.0,)))[0] == 0.0, "a wall hides it"
 
 
 def test_a_path_leads_through_the_door_and_keeps_its_clearance() -> None:

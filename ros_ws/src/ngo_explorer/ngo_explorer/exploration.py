@@ -206,7 +206,7 @@ class Exploration:
 
     def _reached(self, field: NDArray[np.int32], points: Floats) -> NDArray[np.bool_]:
         """Which points ``(n, 2)`` paths lead to."""
-        blocks = np.array([self.known.cell(point) for point in points]) // self.known.block
+        blocks = self.known.cells(points) // self.known.block
         row, column = np.clip(blocks + 1, 0, np.array(field.shape) + 1).T
         return np.asarray(np.pad(field, 1, constant_values=-1)[row, column] >= 0)
 

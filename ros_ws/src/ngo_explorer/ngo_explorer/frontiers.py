@@ -102,31 +102,29 @@ def viewpoint(
     """
     count = len(frontier.points_xy)
     picks = frontier.points_xy[np.linspace(0, count - 1, min(_SAMPLES, count)).astype(np.int64)]
-    cells = np.array([known.cell(point) for point in barred], np.int64).reshape(-1, 2)
     found, costs = _viewpoints(
         known.state,
         known.clearance_m,
         field,
         known.block,
-        np.array([known.cell(point) for point in picks], np.int64) @ (known.state.shape[1], 1),
+        known.cells(picks) @ (known.state.shape[1], 1),
         need_m,
         known.resolution_m,
         reach_m,
-        cells,
+        known.cells(barred),
     )
     if not len(found):
         return None
     points = known.points(found)
     gaps = np.hypot(*(points - frontier.point_xy).T)
-    gains = np.array([gain_m2(known, point, gap + range_m) for point, gap in zip(points, gaps, strict=True)])
+    gains = gains_m2(known, points, gaps + range_m)
     best = int(np.flatnonzero(gains >= 0.5 * gains.max())[0])
     return points[best], float(costs[best]), float(gains[best])
 
 
-def gain_m2(known: KnownMap, point_xy: Floats, range_m: float) -> float:
-    """Unknown area that rays from a point may see: they pass the unknown, and end at obstacles and at the range."""
-    row, column = known.cell(point_xy)
-    return float(_gain(known.state, row, column, known.resolution_m, range_m))
+def gains_m2(known: KnownMap, points_xy: Floats, ranges_m: Floats) -> Floats:
+    """``(n,)`` unknown area that rays from points ``(n, 2)`` may see: up to obstacles and to the range ``(n,)``."""
+    return np.asarray(_gains(known.state, known.cells(points_xy), known.resolution_m, ranges_m))
 
 
 @njit(cache=True)
@@ -215,17 +213,19 @@ def _viewpoints(
 
 
 @njit(cache=True)
-def _gain(state: Cells, row: int, column: int, resolution: float, reach: float) -> float:
+def _gains(state: Cells, cells: Ints, resolution: float, reaches: Floats) -> Floats:
     rows, columns = state.shape
-    area = 0.0
-    for ray in range(_DIRECTIONS):
-        angle = (ray + 0.5) * math.tau / _DIRECTIONS
-        dy, dx = math.sin(angle), math.cos(angle)
-        for step in range(1, int(reach / resolution)):
-            r, c = math.floor(row + 0.5 + step * dy), math.floor(column + 0.5 + step * dx)
-            inside = 0 <= r < rows and 0 <= c < columns
-            if inside and state[r, c] == 1:
-                break
-            if not inside or state[r, c] == -1:
-                area += step * resolution * resolution * math.tau / _DIRECTIONS
-    return area
+    areas = np.zeros(len(cells))
+    for index in range(len(cells)):
+        row, column = cells[index]
+        for ray in range(_DIRECTIONS):
+            angle = (ray + 0.5) * math.tau / _DIRECTIONS
+            dy, dx = math.sin(angle), math.cos(angle)
+            for step in range(1, int(reaches[index] / resolution)):
+                r, c = math.floor(row + 0.5 + step * dy), math.floor(column + 0.5 + step * dx)
+                inside = 0 <= r < rows and 0 <= c < columns
+                if inside and state[r, c] == 1:
+                    break
+                if not inside or state[r, c] == -1:
+                    areas[index] += step * resolution * resolution * math.tau / _DIRECTIONS
+    return areas

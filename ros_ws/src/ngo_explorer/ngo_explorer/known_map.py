@@ -18,6 +18,7 @@ Floats = NDArray[np.float64]
 Cells = NDArray[np.int8]
 
 _NEAR_CELLS = 3.0  # an obstacle that is nearer than this in the map is the same
+_NEAR, _NEAR_WALLS = 1, 2  # of a tile: a cell in or beside it changes, and one that is occupied or was
 _TILE = 64  # cells along the side of a tile, at least
 
 
@@ -65,7 +66,7 @@ class KnownMap:
 
     def mark(self, points_xy: Floats) -> None:
         """Take points ``(n, 2)`` that the map has nothing near for occupied, whatever it says of them later."""
-        rows, columns = self._cells(points_xy).T
+        rows, columns = self.cells(points_xy).T
         inside = (rows >= 0) & (rows < self.state.shape[0]) & (columns >= 0) & (columns < self.state.shape[1])
         points_xy, rows, columns = points_xy[inside], rows[inside], columns[inside]
         # Clearance is known up to comfort_m only.
@@ -79,7 +80,7 @@ class KnownMap:
         if not len(self._marked):
             return False
         values = self._values()
-        values[tuple(self._cells(self._marked).T)] = FREE
+        values[tuple(self.cells(self._marked).T)] = FREE
         self._marked = np.zeros((0, 2))
         self._take(values)
         return True
@@ -93,10 +94,11 @@ class KnownMap:
 
     def cell(self, point_xy: Floats) -> tuple[int, int]:
         """Row and column of the cell that holds a point; it may be outside of the map."""
-        row, column = self._cells(point_xy[:2]).tolist()
+        row, column = self.cells(point_xy[:2]).tolist()
         return row, column
 
-    def _cells(self, points_xy: Floats) -> NDArray[np.int64]:
+    def cells(self, points_xy: Floats) -> NDArray[np.int64]:
+        """``(n, 2)`` row and column of the cells that hold points ``(n, 2)``; they may be outside of the map."""
         return np.asarray(np.floor((points_xy - self._corner) / self.resolution_m).astype(np.int64)[..., ::-1])
 
     @property
@@ -160,25 +162,24 @@ class KnownMap:
 
     def _take(self, values: NDArray[np.int8]) -> bool:
         if len(self._marked):
-            values[tuple(self._cells(self._marked).T)] = 100
-        tile, changed = self._tile, np.zeros(self._known.shape, np.bool_)
-        _write(self.state, values, tile, changed)
+            values[tuple(self.cells(self._marked).T)] = 100
+        tile, changed = self._tile, np.zeros(self._known.shape, np.int8)
+        _write(self.state, values, tile, int(self.comfort_m / self.resolution_m), changed)
         if not changed.any():
             return False
         self.changes += 1
         for row, column in np.argwhere(changed).tolist():
-            area = self.state[row * tile : (row + 1) * tile, column * tile : (column + 1) * tile]
-            self._known[row, column] = np.count_nonzero(area != UNKNOWN)
-        # What lies beside a changed tile may be nearer to an obstacle now, or at the edge of the unknown.
-        for row, column in np.argwhere(_beside(changed)).tolist():
-            self._follow(row, column)
+            self._follow(row, column, bool(changed[row, column] == _NEAR_WALLS))
         return True
 
-    def _follow(self, tile_row: int, tile_column: int) -> None:
-        """Compute anew what follows from the cells in and around a tile."""
+    def _follow(self, tile_row: int, tile_column: int, near_walls: bool) -> None:
+        """Compute anew what follows from the cells in and around a tile; clearance only near walls that changed."""
         tile = self._tile
         row, column = tile_row * tile, tile_column * tile
-        _clear(self.state, self.clearance_m, row, column, tile, self.resolution_m, self.comfort_m)
+        if near_walls or not self._known[tile_row, tile_column]:
+            _clear(self.state, self.clearance_m, row, column, tile, self.resolution_m, self.comfort_m)
+        area = self.state[row : row + tile, column : column + tile]
+        self._known[tile_row, tile_column] = np.count_nonzero(area != UNKNOWN)
         _roomy(self.state, self.clearance_m, self.roomy_m, row, column, tile, self.block)
         self._frontiers[tile_row, tile_column] = _edge(self.state, self.frontier, row, column, tile)
 
@@ -191,23 +192,23 @@ def _grown(before: NDArray, shape: tuple[int, int], shift: tuple[int, int], unit
     return grown
 
 
-def _beside(changed: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    padded = np.pad(changed, 1)
-    rows, columns = changed.shape
-    parts = [padded[row : row + rows, column : column + columns] for row in range(3) for column in range(3)]
-    return np.logical_or.reduce(parts)
-
-
 @njit(cache=True)
-def _write(state: Cells, values: NDArray[np.int8], tile: int, changed: NDArray[np.bool_]) -> None:
-    """Enter values in percent, and mark the tiles that change."""
-    for row in range(state.shape[0]):
-        for column in range(state.shape[1]):
+def _write(state: Cells, values: NDArray[np.int8], tile: int, reach: int, changed: NDArray[np.int8]) -> None:
+    """Enter values in percent, and mark the tiles in and beside which a cell changes, or up to ``reach`` from a wall's.
+    """
+    rows, columns = state.shape
+    for row in range(rows):
+        for column in range(columns):
             value = values[row, column]
             now = UNKNOWN if value < 0 or 25 < value < 65 else FREE if value <= 25 else OCCUPIED
-            if state[row, column] != now:
+            before = state[row, column]
+            if before != now:
                 state[row, column] = now
-                changed[row // tile, column // tile] = True
+                wall = before == OCCUPIED or now == OCCUPIED
+                mark, around = (_NEAR_WALLS, reach) if wall else (_NEAR, 1)
+                for r in range(max(0, row - around) // tile, min(rows - 1, row + around) // tile + 1):
+                    for c in range(max(0, column - around) // tile, min(columns - 1, column + around) // tile + 1):
+                        changed[r, c] = max(changed[r, c], mark)
 
 
 @njit(cache=True)

@@ -22,9 +22,7 @@ def cost_field(known: KnownMap, start_xy: Floats, need_m: float, targets: Floats
     In tenths of a block's side; a step costs up to three times its length where walls are near. With ``targets``
     ``(n, 2)`` the costs of other blocks may be missing. By Dijkstra's algorithm with buckets (Dial 1969).
     """
-    goals = np.zeros((0, 2), np.int64)
-    if targets is not None:
-        goals = np.array([known.cell(point) for point in targets], np.int64).reshape(-1, 2) // known.block
+    goals = known.cells(np.zeros((0, 2)) if targets is None else targets) // known.block
     starts = _start_blocks(known, start_xy, need_m)
     return np.asarray(_costs(known.roomy_m, need_m, known.comfort_m, starts, goals))
 

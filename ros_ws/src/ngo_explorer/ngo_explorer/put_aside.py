@@ -29,7 +29,7 @@ class PutAside:
     """The places that were given up for now."""
 
     def __init__(self) -> None:
-        self._places: list[_Place] = []
+        self._places, self._points = list[_Place](), np.zeros((0, 2))
 
     def add(self, known: KnownMap, frontier: Frontier, viewpoint_xy: Floats, reason: str, again: bool = False) -> None:
         """Put a frontier aside; with ``again`` only this viewpoint, and the frontier may be tried from another one."""
@@ -37,6 +37,7 @@ class PutAside:
         if place is None:
             place = _Place(frontier.point_xy, reason, _around(known, frontier.point_xy), tries=0)
             self._places.append(place)
+            self._points = np.vstack((self._points, place.point_xy))
         place.tries += 1
         place.reason, place.seen = reason, _around(known, frontier.point_xy)
         if again:
@@ -66,9 +67,11 @@ class PutAside:
         return np.array(place.viewpoints if place is not None else []).reshape(-1, 2)
 
     def _at(self, point_xy: Floats) -> _Place | None:
-        near = [(float(np.hypot(*(place.point_xy - point_xy))), place) for place in self._places]
-        gap, place = min(near, key=lambda pair: pair[0], default=(np.inf, None))
-        return place if gap < _SAME_M else None
+        if not self._places:
+            return None
+        gaps = np.hypot(*(self._points - point_xy).T)
+        nearest = int(np.argmin(gaps))
+        return self._places[nearest] if gaps[nearest] < _SAME_M else None
 
 
 def _around(known: KnownMap, point_xy: Floats) -> Cells:

@@ -107,7 +107,7 @@ def _between(seen: Situation, points: Floats) -> Floats:
     """``(n, n)`` costs of the paths between points, in m; fastest where the nearest to the robot come first."""
     known, count = seen.known, len(points)
     unit = known.block * known.resolution_m / 10.0
-    blocks = np.array([known.cell(point) for point in points]) // known.block
+    blocks = known.cells(points) // known.block
     between = np.zeros((count, count))
     # A search ends at the farthest of the points that are left: those near the robot come last, near each other.
     for index in range(count - 1, 0, -1):

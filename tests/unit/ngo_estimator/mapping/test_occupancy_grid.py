@@ -121,13 +121,19 @@ def test_what_is_taken_out_leaves_no_trace() -> None:
         np.testing.assert_array_equal(before.origin_xy, after.origin_xy)
 
 
-def test_neither_the_order_nor_the_growth_of_the_grid_changes_the_counts() -> None:
+def test_neither_order_nor_growth_nor_looks_in_between_change_the_map() -> None:
     scans, poses = random_scans(30, 2)
     epochs = np.arange(30) // 10
     together, one_by_one = OccupancyGrid(0.05), OccupancyGrid(0.05)
     together.add(scans, poses, epochs)
     for k in reversed(range(30)):
-        one_by_one.add(scans[k : k + 1], poses[k : k + 1], epochs[k : k + 1])
+        one = scans[k : k + 1], poses[k : k + 1], epochs[k : k + 1]
+        one_by_one.add(*one)
+        one_by_one.cells(SURE if k % 7 else OccupancyConfig())
+        if k % 3 == 0:
+            one_by_one.remove(*one)
+            one_by_one.cells(SURE)
+            one_by_one.add(*one)
     np.testing.assert_array_equal(together.cells(SURE).values, one_by_one.cells(SURE).values)
 
 

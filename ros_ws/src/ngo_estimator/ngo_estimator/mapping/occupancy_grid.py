@@ -24,6 +24,8 @@ UNKNOWN = -1
 _CHUNK = 64  # cells by which the grid grows
 _MOST_CELLS = 40_000_000
 _MOST_GRAZED = 24.0  # cells at the end of a ray that are not called free, however flat it meets a wall
+_NOTHING = (_MOST_CELLS, _MOST_CELLS, 0, 0)
+"""Low row and column, and the high ones beyond them, of no cell."""
 Counts = NDArray[np.int32]
 Epochs = NDArray[np.int64]
 
@@ -67,9 +69,10 @@ class OccupancyMap:
 
     def trinary(self, free: float, occupied: float) -> "OccupancyMap":
         """The same map with the values 0 up to the probability ``free``, 100 from ``occupied`` on, else -1."""
-        values = self.values
-        sure = np.select([values < 0, values <= 100.0 * free, values >= 100.0 * occupied], [UNKNOWN, 0, 100], UNKNOWN)
-        return OccupancyMap(sure.astype(np.int8), self.resolution_m, self.origin_xy)
+        percent = np.arange(256, dtype=np.uint8).view(np.int8)
+        sure = [percent < 0, percent <= 100.0 * free, percent >= 100.0 * occupied]
+        of_percent = np.select(sure, [UNKNOWN, 0, 100], UNKNOWN).astype(np.int8)
+        return OccupancyMap(of_percent[self.values.view(np.uint8)], self.resolution_m, self.origin_xy)
 
     def cropped(self) -> "OccupancyMap":
         """The part that anything is known of."""
@@ -111,6 +114,8 @@ class OccupancyGrid:
         self._low = np.zeros(2, np.int64)  # column and row, counted from the cell round the frame's origin
         self._cells = np.zeros((0, 0, 6), np.int32)
         self._mark = 0
+        self._values, self._of = np.zeros((0, 0), np.int8), OccupancyConfig()
+        self._stale = _NOTHING
 
     def add(self, scans: Sequence[RangeScan], poses: Array, epochs: Epochs | None = None) -> None:
         """Enter scans of ``epochs`` ``(scans,)``, from 0 on, at poses ``(scans, 3)`` of their base.
@@ -124,9 +129,18 @@ class OccupancyGrid:
         self._render(scans, poses, epochs, -1)
 
     def cells(self, config: OccupancyConfig) -> OccupancyMap:
-        """The probabilities of all cells; the extent grows in large steps, so that it seldom changes."""
-        values = _percent(self._cells, config.hit, config.passed, config.settled)
-        return OccupancyMap(values, self.resolution_m, (self._low.astype(np.float64) - 0.5) * self.resolution_m)
+        """The probabilities of all cells; the extent grows in large steps, so that it seldom changes.
+
+        Where no scan was entered or removed since the last call they are those of then.
+        """
+        rows, columns, _ = self._cells.shape
+        if self._values.shape != (rows, columns) or config != self._of:
+            self._values, self._of = np.empty((rows, columns), np.int8), config
+            self._stale = (0, 0, rows, columns)
+        _percent(self._cells, self._values, *self._stale, config.hit, config.passed, config.settled)
+        self._stale = _NOTHING
+        corner = (self._low.astype(np.float64) - 0.5) * self.resolution_m
+        return OccupancyMap(self._values.copy(), self.resolution_m, corner)
 
     @classmethod
     def summed(cls, grids: Sequence["OccupancyGrid"]) -> "OccupancyGrid":
@@ -157,7 +171,12 @@ class OccupancyGrid:
         sensors = np.array([scan.sensor_xyyaw[:2] for scan in scans])
         eyes = _in_cells(sensors, np.arange(len(scans)), poses, self.resolution_m)
         ends = _in_cells(ends, np.repeat(np.arange(len(scans)), counts), poses, self.resolution_m)
-        self._cover(np.concatenate((eyes, ends)))
+        points = np.concatenate((eyes, ends))
+        self._cover(points)
+        low = (np.floor(points.min(axis=0)).astype(int) - self._low)[::-1]
+        high = (np.floor(points.max(axis=0)).astype(int) - self._low)[::-1] + 1
+        before = self._stale
+        self._stale = (*np.minimum(before[:2], low).tolist(), *np.maximum(before[2:], high).tolist())
         if self._mark > np.iinfo(np.int32).max - len(scans):
             self._cells[..., _MARK], self._mark = 0, 0
         starts = np.concatenate((np.zeros(1, np.int64), np.cumsum(counts)))
@@ -283,15 +302,24 @@ def _free_share(
 
 
 @njit(cache=True)
-def _percent(cells: Counts, hit: float, passed: float, settled: float) -> NDArray[np.int8]:
-    rows, columns, _ = cells.shape
-    values = np.full((rows, columns), UNKNOWN, np.int8)
-    for row in range(rows):
-        for column in range(columns):
+def _percent(
+    cells: Counts,
+    values: NDArray[np.int8],
+    low_row: int,
+    low_column: int,
+    high_row: int,
+    high_column: int,
+    hit: float,
+    passed: float,
+    settled: float,
+) -> None:
+    """Write the values of the cells from a low row and column on, up to a high one of each."""
+    for row in range(low_row, high_row):
+        for column in range(low_column, high_column):
             cell = cells[row, column]
+            values[row, column] = UNKNOWN
             if cell[_HITS] | cell[_PASSES]:
                 odds = cell[_NEW_HITS] * hit - cell[_NEW_PASSES] * passed
                 before = (cell[_HITS] - cell[_NEW_HITS]) * hit - (cell[_PASSES] - cell[_NEW_PASSES]) * passed
                 odds += min(max(before, -settled), settled)
                 values[row, column] = round(100.0 / (1.0 + math.exp(-min(max(odds, -10.0), 10.0))))
-    return values
