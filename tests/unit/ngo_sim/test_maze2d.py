@@ -209,23 +209,6 @@ def test_the_environment_checker_has_nothing_to_say() -> None:
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         check_env(Maze2D(), skip_render_check=True)
-        check_env(Maze2D(render_mode="rgb_array"), skip_render_check=True)
-
-
-def test_the_picture_shows_walls_and_robot_with_y_up() -> None:
-    env = Maze2D(CORRIDOR_CONFIG, render_mode="rgb_array")
-    assert env.render() is None
-    env.reset(seed=0, options={"maze": CORRIDOR, "pose_xyyaw": (2.5, 1.5, 0.0)})
-    picture = env.render()
-    assert picture is not None and picture.dtype == np.uint8 and picture.shape == (5 * 24, 13 * 24, 3)
-
-    def at(x: float, y: float) -> tuple[int, ...]:
-        return tuple(map(int, picture[int((5 - y) * 24), int(x * 24)]))
-
-    assert at(6.5, 1.5) == (255, 255, 255)
-    assert at(6.5, 2.5) == tuple((255 * env.colors[2, 6]).astype(int))
-    assert at(2.4, 1.5) == (30, 30, 30) and at(2.6, 1.5) == (255, 220, 0), "the heading is marked"
-    assert Maze2D(CORRIDOR_CONFIG).render() is None
 
 
 if __name__ == "__main__":  # run by test_a_seed_gives_the_same_bytes_whatever_came_before

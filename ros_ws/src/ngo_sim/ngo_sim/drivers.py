@@ -26,6 +26,7 @@ class Action(IntEnum):
 
 _ACTIONS = tuple(Action)
 _PATIENCE_STEPS = 40  # a half turn on the spot takes about 25
+_LOOKAHEAD_BLOCKS = 0.9  # how far ahead on the path the robot aims
 
 
 class Driver(Protocol):
@@ -63,7 +64,6 @@ class PathDriver:
     turn_per_action_rad: how far one turn action turns the robot until it rests again.
     turn_coast_steps, travel_coast_steps: rotation and travel expected still to come without further
     acceleration, in multiples of the last step's.
-    lookahead_blocks: how far ahead on the path it aims.
 
     The defaults serve both worlds. Both turn about 9 degrees an action; the expected coasting is below that
     of the 2D world (1.5 and 4 steps) and of the 3D world (3 and 4.6 steps), because to overrate it makes the
@@ -81,19 +81,9 @@ class PathDriver:
         turn_per_action_rad: float = math.radians(9.0),
         turn_coast_steps: float = 1.2,
         travel_coast_steps: float = 3.0,
-        lookahead_blocks: float = 0.9,
     ) -> None:
         if goals not in ("corners", "random"):
             raise ValueError(f"goals is {goals!r}; it must be 'corners' or 'random'")
-        for name, value, low, high in (
-            ("random_action_probability", random_action_probability, 0.0, 1.0),
-            ("turn_per_action_rad", turn_per_action_rad, 1e-3, math.pi),
-            ("turn_coast_steps", turn_coast_steps, 0.0, 100.0),
-            ("travel_coast_steps", travel_coast_steps, 0.0, 100.0),
-            ("lookahead_blocks", lookahead_blocks, 0.1, 1.0),
-        ):
-            if not low <= value <= high:
-                raise ValueError(f"{name} is {value!r}; it must be from {low:g} to {high:g}")
         self.goals_reached: list[tuple[int, int]] = []
         self.maze = maze
         self._rng = rng
@@ -101,7 +91,6 @@ class PathDriver:
         self._deadband_rad = 0.5 * turn_per_action_rad  # within it, a turn leaves a larger error than none
         self._turn_coast_steps = turn_coast_steps
         self._travel_coast_steps = travel_coast_steps
-        self._lookahead = lookahead_blocks
         self._goals = self._corner_goals() if goals == "corners" else self._random_goals()
         self.goal: tuple[int, int] | None = None
         self._path: list[tuple[int, int]] = []
@@ -167,7 +156,7 @@ class PathDriver:
         index = self._path_index[block]
         along = float(index) + self._offset_along(x, y, index)
         # Coasting does not follow a bend, yet its length says how far ahead the bend must be begun.
-        along += math.hypot(ahead_x - x, ahead_y - y) + self._lookahead
+        along += math.hypot(ahead_x - x, ahead_y - y) + _LOOKAHEAD_BLOCKS
         along = min(max(along, 0.0), len(self._path) - 1.0)
         start = min(int(along), len(self._path) - 2)
         (row_a, col_a), (row_b, col_b) = self._path[start], self._path[start + 1]

@@ -24,7 +24,6 @@ _TURN: dict[int, float] = {Action.FORWARD: 0.0, Action.TURN_LEFT: 1.0, Action.TU
 _SUBSTEP_RADII = 0.25
 _SETTLING_SUBSTEPS = 20  # at most, after a collision
 _COLLISION_SLOP_M = 1e-6  # overlap that the solver leaves alone
-_PIXELS_A_BLOCK = 24
 _BLOCKED_SHARE = 0.02  # of the speed, taken by a wall that was met
 
 
@@ -84,14 +83,10 @@ class Maze2D(gymnasium.Env[npt.NDArray[np.float32], np.int64]):
     those of s.
     """
 
-    metadata = {"render_modes": ["rgb_array"], "render_fps": 10}
     observation_space: gymnasium.spaces.Box[np.float32]
 
-    def __init__(self, config: Maze2DConfig | None = None, render_mode: str | None = None) -> None:
-        if render_mode not in (None, "rgb_array"):
-            raise ValueError(f"render_mode is {render_mode!r}; it must be None or 'rgb_array'")
+    def __init__(self, config: Maze2DConfig | None = None) -> None:
         self.config = config if config is not None else Maze2DConfig()
-        self.render_mode = render_mode
         self.period_s = self.config.period_s
         self.maze: Maze
         self.colors: npt.NDArray[np.float32]
@@ -197,22 +192,6 @@ class Maze2D(gymnasium.Env[npt.NDArray[np.float32], np.int64]):
         self._yaw = math.remainder(self._body.angle, math.tau)
         self._frame += 1
         return self._scan(), self._info()
-
-    def render(self) -> npt.NDArray[np.uint8] | None:
-        """The world from above, uint8 (height, width, 3), y up; None without a render mode."""
-        if self.render_mode is None or self._space is None:
-            return None
-        picture = np.where(self.maze.walls[..., None], 255 * self.colors, 255).astype(np.uint8)
-        picture = picture.repeat(_PIXELS_A_BLOCK, axis=0).repeat(_PIXELS_A_BLOCK, axis=1)
-        pixel_m = self.config.block_m / _PIXELS_A_BLOCK
-        row, col = np.ogrid[: picture.shape[0], : picture.shape[1]]
-        x, y = (col + 0.5) * pixel_m - self._x, (row + 0.5) * pixel_m - self._y
-        ahead = x * math.cos(self._yaw) + y * math.sin(self._yaw)
-        aside = y * math.cos(self._yaw) - x * math.sin(self._yaw)
-        disc = x * x + y * y <= self.config.radius_m**2
-        picture[disc] = (30, 30, 30)
-        picture[disc & (ahead >= 0) & (abs(aside) <= 0.3 * self.config.radius_m)] = (255, 220, 0)
-        return picture[::-1].copy()
 
     def _drawn(self, rng: np.random.Generator) -> tuple[Maze, npt.NDArray[np.float32]]:
         """A maze, and the colours (height, width, 3) of its blocks."""
