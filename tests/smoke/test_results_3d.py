@@ -77,7 +77,7 @@ def test_every_row_of_every_table_has_every_number(made: tuple[Path, dict[str, A
     assert (result["trajectories"], result["steps"], result["seeds"]) == (2, STEPS, [0])
     assert list(result["tables"]) == TABLES
     assert {"local", "local_no_action", "deepvo", "paper_1", "paper_5", "ngo_1", "ngo_5", "gauss_newton", "gtsam",
-            "smoothed", "gtsam_smoothed", "true_pairs", "oracle",
+            "smoothed", "gtsam_smoothed",
             "end_to_end"} < set(rows_of(world_named("maze3d")))  # fmt: skip
     for table in result["tables"].values():
         assert list(table) == rows_of(world_named("maze3d"))

@@ -1,10 +1,5 @@
-"""Loops for the classical pose graph: found by place codes, or known from the truth.
+"""Loops and odometry for the classical pose graph: those of our own optimizer."""
 
-``found_loops`` gives the loops of our own optimizer. True revisits show the cause of the remaining error. It is
-retrieval if they help when the pair head measures them, and measurement if they help only when known exactly.
-"""
-
-import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
@@ -13,18 +8,14 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ngo_estimator.geometry import se2
-from ngo_estimator.loops.loop_closure import LoopSearch, find_loops, frame_odometry
+from ngo_estimator.loops.loop_closure import LoopSearch, find_loops
 from ngo_estimator.loops.overlaps import find_overlaps
-from ngo_estimator.loops.pair_measurement import VIEWS, PairViews, measure_pairs
 from ngo_estimator.networks.odometry_smoothing import OdometrySmoother
 from ngo_estimator.networks.place_encoder import PairHead
 from ngo_estimator.ngo.pose_aggregation import poses_in_blocks
 from ngo_estimator.ngo.registered_odometry import registered_steps
 
 _TOGETHER = 8  # trajectories that go through the pair head at once
-EXACT_SCALE = (1e-3, 1e-3)
-"""Scale (m, rad) of a loop that is known exactly."""
 
 
 @dataclass(frozen=True)
@@ -138,62 +129,6 @@ def overlaps_of(
         return LoopFactors(*(column[loops.valid].numpy() for column in columns))
 
     return [partial(more, number=number) for number in range(len(codes))]
-
-
-def true_revisits(
-    truth: np.ndarray, search: LoopSearch, block: int = 8, radius_m: float = 0.5
-) -> tuple[np.ndarray, np.ndarray]:
-    """Earlier frames ``(n,)``, and the meta-steps ``(n,)`` whose last frame is at the same place, in any heading.
-
-    As the search by place codes, but with the nearest in position among the true poses ``(steps, 3)`` for the most
-    similar, and none farther away than ``radius_m``. Of more than ``most``, every so manieth is kept.
-    """
-    positions = torch.from_numpy(np.array(truth[:, :2], dtype=np.float64))
-    distance = torch.cdist(positions[block - 1 :: block], positions).unflatten(-1, (-1, block))
-    best, best_step = distance.min(dim=-1)
-    index = torch.arange(len(best))
-    best = best.masked_fill(index[:, None] - index < search.min_separation, math.inf)
-    frames, ends = [], []
-    for _ in range(min(search.per_pose, len(best))):
-        nearest, at = best.min(dim=-1, keepdim=True)
-        near = nearest[:, 0] <= radius_m
-        frames.append((at * block + best_step.gather(-1, at))[near, 0])
-        ends.append(index[near])
-        best = best.masked_fill((index - at).abs() <= search.min_apart, math.inf)
-    frame, end = torch.cat(frames), torch.cat(ends)
-    order = torch.argsort(end, stable=True)
-    kept = order[torch.linspace(0, len(order) - 1, min(len(order), search.most)).round().long()]
-    return frame[kept].numpy(), end[kept].numpy()
-
-
-def measured_revisits(
-    pair_head: PairHead, seen: Seen, truth: np.ndarray, search: LoopSearch, block: int = 8
-) -> LoopFactors:
-    """True revisits of one trajectory, alone in ``seen``, measured as ``find_loops`` does; truth: ``(steps, 3)``."""
-    frames, ends = true_revisits(truth, search, block)
-    codes, in_blocks = _float32(seen.codes), poses_in_blocks(seen.registered(pair_head, search, block)[0], block)
-    earlier, later = torch.from_numpy(frames), torch.from_numpy(ends * block + block - 1)
-    with torch.inference_mode():
-        pairs = earlier.unsqueeze(0), later.unsqueeze(0)
-        views = PairViews.of_trajectories(codes, frame_odometry(in_blocks), *pairs, VIEWS[: search.views])
-        (measured, log_scale, _), _ = measure_pairs(pair_head, views, search.registrations)
-        measured = se2.compose(in_blocks.flatten(1, 2)[:, earlier], measured)
-    return LoopFactors(frames // block, ends, measured[0].numpy(), log_scale[0].numpy(), _certain(frames))
-
-
-def exact_revisits(truth: np.ndarray, search: LoopSearch, block: int = 8) -> LoopFactors:
-    """True revisits of one trajectory ``(steps, 3)`` with their true relative poses: what perfect loops would be."""
-    frames, ends = true_revisits(truth, search, block)
-    start = frames // block
-    poses = torch.from_numpy(np.concatenate((np.zeros((1, 3)), truth[block - 1 :: block])))
-    measured = se2.between(poses[start], poses[ends + 1]).numpy()
-    log_scale = np.tile(np.log(EXACT_SCALE), (len(start), 1))
-    return LoopFactors(start, ends, measured, log_scale, _certain(frames))
-
-
-def _certain(frames: np.ndarray) -> np.ndarray:
-    """The belief in what is known to be the same place."""
-    return np.full(len(frames), math.inf)
 
 
 def _parts(seen: Seen) -> list[Seen]:

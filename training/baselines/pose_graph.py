@@ -6,7 +6,7 @@ factors come from ``find_loops``. ``training.tune_pose_graph`` chooses the scale
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import Any, Literal
 
 import gtsam
@@ -17,7 +17,7 @@ from ngo_estimator.data.configuration import check, check_positive
 from ngo_estimator.geometry import se2
 from ngo_estimator.loops.loop_closure import LoopSearch
 from ngo_estimator.ngo.pose_aggregation import block_variances, frame_poses, poses_in_blocks
-from training.baselines.loop_factors import LoopFactors, MoreLoops, exact_revisits
+from training.baselines.loop_factors import LoopFactors, MoreLoops
 
 Kernel = Literal["none", "huber", "cauchy", "geman_mcclure", "dcs"]
 _KERNELS: dict[str, Callable[[float], Any]] = {
@@ -96,14 +96,6 @@ def optimize(
     poses = torch.from_numpy(graph.solve())
     meta_relative = se2.between(poses[:-1], poses[1:])
     return frame_poses(in_blocks, meta_relative.unsqueeze(0))[0].numpy()
-
-
-def optimize_exact(
-    relative: np.ndarray, log_std: np.ndarray, truth: np.ndarray, settings: PoseGraphSettings
-) -> np.ndarray:
-    """The poses with perfect loops: as ``optimize``, with true revisits and their true relative poses."""
-    exact = replace(settings, kernel="none", drift_m=0.0, loop_position_scale=1.0, loop_heading_scale=1.0)
-    return optimize(relative, log_std, exact_revisits(truth, settings.search, settings.block), exact)
 
 
 class _Graph:

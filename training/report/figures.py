@@ -26,7 +26,6 @@ from training.scoring.table_rows import ROWS, Sources, rows_of
 TRUTH, LOCAL_COLOR, CORRECTED = "#1f6fd6", "#2ca02c", "#ff7f0e"
 COLORS = {
     "local": LOCAL_COLOR,
-    "local_calibrated": "#8fce8f",
     "local_no_action": "#1b5e20",
     "deepvo": "#0097a7",
     "paper_1": "#c5a3d9",
@@ -39,8 +38,6 @@ COLORS = {
     "gtsam_registered": "#1a9988",
     "smoothed": "#b8860b",
     "gtsam_smoothed": "#1a9988",
-    "true_pairs": "#bcbd22",
-    "oracle": "#9a9a9a",
     "end_to_end": "#e377c2",
 }
 MAIN_ROWS = (
@@ -48,7 +45,6 @@ MAIN_ROWS = (
     "deepvo",
     "paper_5",
     "gtsam",
-    "oracle",
     "ngo_1",
     "registered",
     "gtsam_registered",

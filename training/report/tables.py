@@ -17,7 +17,6 @@ Table = Mapping[str, Sequence[Measured]]
 """The measurements of each row, one for each training seed."""
 
 PAIRS = (
-    ("local", "local_calibrated"),
     ("smoothed", "local"),
     ("local_no_action", "local"),
     ("deepvo", "local"),
@@ -35,8 +34,6 @@ PAIRS = (
     ("ngo_5", "gtsam"),
     ("ngo_5", "gtsam_registered"),
     ("ngo_5", "gtsam_smoothed"),
-    ("ngo_5", "oracle"),
-    ("gtsam", "oracle"),
     ("end_to_end", "ngo_5"),
 )
 """Rows that are compared on the same trajectories."""

@@ -20,10 +20,9 @@ from ngo_estimator.networks.place_encoder import PairHead
 from ngo_estimator.ngo.neural_graph_optimizer import NeuralGraphOptimizer
 from ngo_estimator.ngo.pose_aggregation import PoseAggregationConfig
 from training.baselines import loop_factors
-from training.baselines.graph_settings import REGISTRATIONS, fit_calibration, load_settings
+from training.baselines.graph_settings import REGISTRATIONS, load_settings
 from training.baselines.loop_factors import MoreLoops, Seen
-from training.baselines.pose_graph import PoseGraphSettings, optimize, optimize_exact
-from training.data.feature_store import open_store
+from training.baselines.pose_graph import PoseGraphSettings, optimize
 from training.scoring.table_rows import ROWS, Sources
 
 Arrays = dict[str, np.ndarray]
@@ -62,9 +61,6 @@ def estimators(row: str, seeds: int, sources: Sources, prepared: Prepared | None
     kind = ROWS[row]
     if row == "local" or kind.odometry is not None:
         return [Estimator(local, row)]
-    if row == "local_calibrated":
-        calibration = calibration_of(sources)
-        return [Estimator(lambda arrays: local(calibrated(arrays, calibration)), f"{row} {json.dumps(calibration)}")]
     if kind.own_networks:
         own = sources.of_row(row, 0)
         return [_trained(own, own.networks)]
@@ -81,7 +77,7 @@ def estimators(row: str, seeds: int, sources: Sources, prepared: Prepared | None
             return [Estimator(partial(smoothed, smoother), identity)]
     form = "registered" if kind.registered else "smoothed" if kind.smoothed else "loops"
     settings = load_settings(sources.settings_file(form))
-    poses = pose_graph(row, settings, place.pair_head, smoother=smoother)
+    poses = pose_graph(settings, place.pair_head, kind.registered, smoother)
     return [Estimator(poses, f"{identity} {json.dumps(dataclasses.asdict(settings))}")]
 
 
@@ -113,19 +109,6 @@ def seen_in(arrays: Arrays, relative: np.ndarray | None = None) -> Seen:
     """Inputs of the search for loops, with the odometry of the arrays or another one."""
     steps = arrays["relative"] if relative is None else relative
     return Seen(steps, arrays["log_std"], arrays["codes"], arrays["origin_code"])
-
-
-def calibration_of(sources: Sources) -> dict[str, tuple[float, float, float]]:
-    """Constant gain and bias of each component of a step, least squares over the validation mazes of all tables."""
-    stores = [open_store(sources.store_folder("validation", table)) for table in sources.world.unseen_tables]
-    relative, truth = (np.concatenate([store[name] for store in stores]) for name in ("relative", "truth"))
-    return fit_calibration(relative, truth)
-
-
-def calibrated(arrays: Arrays, calibration: dict[str, tuple[float, float, float]]) -> Arrays:
-    """The arrays with a constant calibration applied to the odometry."""
-    relative = arrays["relative"] * np.array(calibration["odometry_gain"]) + np.array(calibration["odometry_bias"])
-    return {**arrays, "relative": relative}
 
 
 def _trained(sources: Sources, optimizer_folder: Path, prepared: Prepared | None = None) -> Estimator:
@@ -180,36 +163,28 @@ def optimized_by(
 
 
 def pose_graph(
-    row: str, settings: PoseGraphSettings, pair_head: PairHead, smoother: OdometrySmoother | None = None
+    settings: PoseGraphSettings,
+    pair_head: PairHead,
+    registers: bool = False,
+    smoother: OdometrySmoother | None = None,
 ) -> Callable[[Arrays], np.ndarray]:
-    """The classical rows: GTSAM with the loops that are found, or with true ones; ``smoother`` is of smoothed rows."""
+    """The classical rows: GTSAM with the loops that are found, on odometry that is registered or smoothed before."""
 
     def poses(arrays: Arrays) -> np.ndarray:
         whole = prefix(arrays, _whole(arrays["relative"].shape[1], settings.block))
-        truth, seen = whole["truth"], seen_in(whole, settings.calibrated(whole["relative"]))
+        seen = seen_in(whole, settings.calibrated(whole["relative"]))
         steps = whole["relative"], whole["log_std"]
-        if ROWS[row].registered:
+        if registers:
             steps = loop_factors.registered_odometry(pair_head, seen, settings.search, settings.block)
         if smoother is not None:
             steps = loop_factors.smoothed_odometry(smoother, *steps, whole["motion"])
-        odometry = list(zip(*steps, strict=True))
-        if row == "oracle":
-            solved = [optimize_exact(*one, true, settings) for one, true in zip(odometry, truth, strict=True)]
-        else:
-            if row == "true_pairs":
-                measured_revisits, of_search = loop_factors.measured_revisits, (settings.search, settings.block)
-                loops = [
-                    measured_revisits(pair_head, seen.part(slice(k, k + 1)), true, *of_search)
-                    for k, true in enumerate(truth)
-                ]
-            else:
-                loops = loop_factors.found_loops(pair_head, seen, settings.search, settings.block)
-            more: Sequence[MoreLoops | None] = [None] * len(truth)
-            if settings.search.overlaps and row != "true_pairs":
-                moved = settings.calibrated(steps[0])
-                more = loop_factors.overlaps_of(pair_head, whole["codes"], moved, settings.search, settings.block)
-            added = zip(odometry, loops, more, strict=True)
-            solved = [optimize(*one, found, settings, of) for one, found, of in added]
+        loops = loop_factors.found_loops(pair_head, seen, settings.search, settings.block)
+        more: Sequence[MoreLoops | None] = [None] * len(loops)
+        if settings.search.overlaps:
+            moved = settings.calibrated(steps[0])
+            more = loop_factors.overlaps_of(pair_head, whole["codes"], moved, settings.search, settings.block)
+        graphs = zip(*steps, loops, more, strict=True)
+        solved = [optimize(relative, std, found, settings, of) for relative, std, found, of in graphs]
         left = torch.from_numpy(settings.calibrated(arrays["relative"]))
         return _with_tail(torch.from_numpy(np.stack(solved)), left).numpy()
 

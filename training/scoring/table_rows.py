@@ -31,7 +31,6 @@ class Row:
 
 ROWS = {
     "local": Row("odometry of the local network"),
-    "local_calibrated": Row("the same, with a constant bias and gain fitted on validation"),
     "registered": Row("odometry, each meta-step measured again by registering scans; no loops", registered=True),
     "smoothed": Row("odometry, smoothed as in our optimizer; no loops", smoothed=True),
     "local_no_action": Row(
@@ -47,8 +46,6 @@ ROWS = {
     "gtsam": Row("robust pose graph (GTSAM), same odometry and loops, tuned on validation"),
     "gtsam_registered": Row("`gtsam` on the odometry of `registered`, with settings of its own", registered=True),
     "gtsam_smoothed": Row("`gtsam` on the odometry of `smoothed`, with settings of its own", smoothed=True),
-    "true_pairs": Row("GTSAM with true revisits, measured by our pair head"),
-    "oracle": Row("GTSAM with true revisits, measured exactly"),
 }
 
 

@@ -13,16 +13,8 @@ from ngo_estimator.loops.overlaps import find_overlaps
 from ngo_estimator.ngo.pose_aggregation import poses_in_blocks
 from tests.unit.ngo_estimator.rooms import camera_pair_head, drive_with_a_camera
 from tests.unit.ngo_estimator.samples import small_pair_head, with_origin
-from training.baselines.loop_factors import (
-    LoopFactors,
-    Seen,
-    exact_revisits,
-    found_loops,
-    measured_revisits,
-    overlaps_of,
-    true_revisits,
-)
-from training.baselines.pose_graph import PoseGraphSettings, optimize, optimize_exact
+from training.baselines.loop_factors import LoopFactors, Seen, found_loops, overlaps_of
+from training.baselines.pose_graph import PoseGraphSettings, optimize
 
 PLAIN = PoseGraphSettings(
     odometry_position_scale=1.0,
@@ -32,7 +24,8 @@ PLAIN = PoseGraphSettings(
     kernel="none",
     drift_m=0.0,
 )
-SEARCH = LoopSearch(per_pose=1, most=200)
+LAP = 16
+"""Meta-steps of a lap."""
 NO_LOOPS = LoopFactors(np.zeros(0, int), np.zeros(0, int), np.zeros((0, 3)), np.zeros((0, 2)), np.zeros(0))
 
 
@@ -63,6 +56,16 @@ def rmse(poses: np.ndarray, truth: np.ndarray) -> float:
 def one_loop(start: int, end: int, measured: list[float], scale: float, logit: float = 5.0) -> LoopFactors:
     log_scale = np.log([[scale, scale]])
     return LoopFactors(np.array([start]), np.array([end]), np.array([measured]), log_scale, np.array([logit]))
+
+
+def exact_loops(truth: np.ndarray, *laps: int) -> LoopFactors:
+    """From each pose to those so many meta-steps later, as both truly are."""
+    poses = torch.from_numpy(np.concatenate((np.zeros((1, 3)), truth[7::8])))
+    start = np.concatenate([np.arange(len(poses) - lap) for lap in laps])
+    end = np.concatenate([np.arange(lap, len(poses)) for lap in laps])
+    measured = se2.between(poses[start], poses[end]).numpy()
+    log_scale = np.full((len(start), 2), np.log(1e-3))
+    return LoopFactors(start, end - 1, measured, log_scale, np.full(len(start), np.inf))
 
 
 def together(a: LoopFactors, b: LoopFactors) -> LoopFactors:
@@ -102,7 +105,7 @@ def test_exact_loops_carry_an_exact_first_lap_over_to_the_others(kernel: Any) ->
     truth, first = driven(steps), len(steps) // 3
     odometry, log_std = noisy(steps, 0.03), stds(steps, 0.03)
     odometry[:first], log_std[:first] = steps[:first], np.log(1e-5)
-    loops = exact_revisits(truth, SEARCH)
+    loops = exact_loops(truth, LAP)
     poses = optimize(odometry, log_std, loops, replace(PLAIN, kernel=kernel))
     ends = slice(7, None, 8)  # between meta-poses the odometry's own noise remains
     assert rmse(driven(odometry)[ends], truth[ends]) > 0.5
@@ -114,7 +117,7 @@ def test_a_robust_kernel_rejects_a_false_loop(kernel: Any) -> None:
     steps = laps(3)
     truth = driven(steps)
     odometry, log_std = noisy(steps, 0.01), stds(steps, 0.01)
-    loops = exact_revisits(truth, SEARCH)
+    loops = exact_loops(truth, LAP)
     loops = replace(loops, log_scale=np.full_like(loops.log_scale, np.log(0.02)))
     # Opposite corners of the square as one place.
     wrong = together(loops, one_loop(8, 31, [0.0, 0.0, 0.0], 0.02))
@@ -124,20 +127,6 @@ def test_a_robust_kernel_rejects_a_false_loop(kernel: Any) -> None:
     assert rmse(optimize(odometry, log_std, wrong, robust), truth) < 1.2 * right
 
 
-def test_perfect_loops_are_a_bound() -> None:
-    steps = laps(3)
-    truth = driven(steps)
-    odometry, log_std = noisy(steps, 0.02), stds(steps, 0.02)
-    settings = replace(PLAIN, search=SEARCH)
-    exact = optimize_exact(odometry, log_std, truth, settings)
-    np.testing.assert_array_equal(exact, optimize(odometry, log_std, exact_revisits(truth, SEARCH), settings))
-    loops = exact_revisits(truth, SEARCH)
-    errors = np.random.default_rng(1).normal(0.0, 0.2, loops.measured.shape)
-    measured = replace(loops, measured=loops.measured + errors, log_scale=np.full_like(loops.log_scale, np.log(0.2)))
-    found = optimize(odometry, log_std, measured, settings)
-    assert rmse(exact, truth) < rmse(found, truth) < rmse(driven(odometry), truth)
-
-
 def test_wrong_loops_are_left_out_though_the_odometry_is_far_beyond_what_measurements_allow() -> None:
     """Exact loops of a millimetre, an odometry that is decimetres off, and a third of the loops wrong."""
     rng = np.random.default_rng(0)
@@ -145,7 +134,7 @@ def test_wrong_loops_are_left_out_though_the_odometry_is_far_beyond_what_measure
     true_steps = np.tile([0.1, 0.0, turn], (steps, 1))
     truth = se2.r2g(torch.from_numpy(true_steps)).numpy()
     odometry = true_steps + np.array([0.0, 0.0, 0.004])
-    loops = exact_revisits(truth, LoopSearch(per_pose=2, most=500), 8)
+    loops = exact_loops(truth, 11, 31)
     measured = loops.measured.copy()
     wrong = rng.random(len(measured)) < 0.33
     measured[wrong] += rng.uniform(-2.0, 2.0, (int(wrong.sum()), 3))
@@ -162,7 +151,7 @@ def test_wrong_loops_are_left_out_though_the_odometry_is_far_beyond_what_measure
 def test_further_loops_are_asked_for_under_the_poses_without_them() -> None:
     true_steps = laps(3)
     truth, steps = driven(true_steps), noisy(true_steps, 0.02)
-    exact = exact_revisits(truth, SEARCH, 8)
+    exact = exact_loops(truth, LAP)
     asked: list[np.ndarray] = []
 
     def more(nodes: np.ndarray) -> LoopFactors:
@@ -175,14 +164,7 @@ def test_further_loops_are_asked_for_under_the_poses_without_them() -> None:
     np.testing.assert_allclose(poses, optimize(steps, stds(steps, 0.02), exact, PLAIN), atol=1e-6)
 
 
-REVISITS = LoopSearch(per_pose=3, most=1000, min_separation=6, min_apart=1)
-
-
-def circles(steps: int = 800) -> np.ndarray:
-    """Truth ``(steps, 3)``: 200 steps a round of 1 m radius, each round 5 cm farther out than the one before."""
-    turn = 2.0 * np.pi * np.arange(1, steps + 1) / 200.0
-    radius = 1.0 + 0.05 * turn / (2.0 * np.pi)
-    return np.column_stack((radius * np.cos(turn), radius * np.sin(turn), turn + np.pi / 2.0))
+SEARCH = LoopSearch(per_pose=3, most=1000, min_separation=6, min_apart=1)
 
 
 def drives(trajectories: int, steps: int = 160) -> Seen:
@@ -194,46 +176,15 @@ def drives(trajectories: int, steps: int = 160) -> Seen:
 
 def test_found_loops_are_those_of_the_optimizer_whatever_goes_with_them() -> None:
     seen = drives(11)
-    found = found_loops(small_pair_head(), seen, REVISITS)
+    found = found_loops(small_pair_head(), seen, SEARCH)
     assert len(found) == 11
     for number in (0, 7, 8, 10):
         inputs = (torch.from_numpy(array[number : number + 1]).float() for array in (seen.codes, seen.relative))
-        loops = find_loops(small_pair_head(), next(inputs), poses_in_blocks(next(inputs), 8), REVISITS)
+        loops = find_loops(small_pair_head(), next(inputs), poses_in_blocks(next(inputs), 8), SEARCH)
         valid = loops.valid[0]
         assert 0 < valid.sum() < len(valid)
         for name, value in vars(found[number]).items():
             np.testing.assert_allclose(value, getattr(loops, name)[0][valid].detach(), atol=1e-5, err_msg=name)
-
-
-def test_true_revisits_are_near_and_separated_and_as_many_as_are_looked_for() -> None:
-    truth = circles()
-    frames, ends = true_revisits(truth, REVISITS)
-    distance = np.linalg.norm(truth[frames, :2] - truth[8 * ends + 7, :2], axis=1)
-    assert distance.max() <= 0.5
-    assert (ends - frames // 8).min() >= REVISITS.min_separation
-    # From the third round on there are places enough that are not next to each other.
-    for end in range(55, 100):
-        blocks = np.sort(frames[ends == end] // 8)
-        assert len(blocks) == REVISITS.per_pose and np.diff(blocks).min() > REVISITS.min_apart
-    assert not (ends < 6).any()
-    best = {end: distance[ends == end].min() for end in range(30, 100)}
-    assert max(best.values()) < 0.06
-
-
-def test_measured_revisits_are_true_places_with_what_the_pair_head_says() -> None:
-    seen = drives(1, 800)
-    truth, search = circles(), replace(REVISITS, views=1)
-    loops = measured_revisits(small_pair_head(), seen, truth, search)
-    frames, ends = true_revisits(truth, search)
-    np.testing.assert_array_equal(loops.start, frames // 8)
-    np.testing.assert_array_equal(loops.end, ends)
-    assert (loops.logit == np.inf).all()
-    codes = torch.from_numpy(seen.codes[0]).float()
-    with torch.no_grad():
-        measured, log_scale, _ = small_pair_head()(codes[frames[5]], codes[8 * ends[5] + 7])
-    steps = torch.from_numpy(seen.relative[0])[frames[5] // 8 * 8 : frames[5] + 1]
-    np.testing.assert_allclose(loops.measured[5], se2.compose(se2.r2g(steps)[-1], measured), atol=1e-5)
-    np.testing.assert_allclose(loops.log_scale[5], log_scale, atol=1e-5)
 
 
 def test_overlaps_are_those_of_the_optimizer_under_the_graphs_poses() -> None:

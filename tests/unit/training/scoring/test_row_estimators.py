@@ -69,14 +69,13 @@ def test_many_trajectories_come_out_as_single_ones(form: str, steps: int, pair_h
         np.testing.assert_allclose(np.remainder(turn + np.pi, 2 * np.pi) - np.pi, 0.0, atol=0.02 * moved)
 
 
-def test_the_classical_rows_keep_the_odometry_behind_the_last_whole_block(pair_head: PairHead) -> None:
+def test_the_classical_graph_keeps_the_odometry_behind_the_last_whole_block(pair_head: PairHead) -> None:
     some = arrays()
-    for row in ("gtsam", "true_pairs", "oracle"):
-        poses = pose_graph(row, PoseGraphSettings(), pair_head)(some)
-        assert poses.shape == (3, STEPS, 3)
-        steps = np.diff(poses[:, 95:, :2], axis=1)
-        expected = np.diff(local(some)[:, 95:, :2], axis=1)
-        np.testing.assert_allclose(np.linalg.norm(steps, axis=2), np.linalg.norm(expected, axis=2), atol=1e-6)
+    poses = pose_graph(PoseGraphSettings(), pair_head)(some)
+    assert poses.shape == (3, STEPS, 3)
+    steps = np.diff(poses[:, 95:, :2], axis=1)
+    expected = np.diff(local(some)[:, 95:, :2], axis=1)
+    np.testing.assert_allclose(np.linalg.norm(steps, axis=2), np.linalg.norm(expected, axis=2), atol=1e-6)
 
 
 def test_a_prefix_has_its_first_frame_and_nothing_that_follows() -> None:
@@ -130,10 +129,8 @@ def test_what_is_registered_is_what_our_optimizer_takes() -> None:
     np.testing.assert_allclose(poses[:, :steps], se2.r2g(expected.double()), atol=1e-5)
     errors = [np.linalg.norm((p - truth)[0, :steps, :2], axis=1).max() for p in (poses, local(some))]
     assert errors[0] < 0.2 * errors[1]
-    graphs = [
-        pose_graph(row, PoseGraphSettings(search=optimizer.config.search), head)
-        for row in ("gtsam", "gtsam_registered")
-    ]
+    settings = PoseGraphSettings(search=optimizer.config.search)
+    graphs = [pose_graph(settings, head, registers) for registers in (False, True)]
     without, with_registered = (np.linalg.norm((g(some) - truth)[0, :steps, :2], axis=1).max() for g in graphs)
     assert with_registered < without
 
@@ -150,7 +147,7 @@ def test_frames_that_share_walls_help_our_optimizer_and_the_classical_graph() ->
             odometry_position_scale=1.0, odometry_heading_scale=1.0, min_logit=4.0, search=search
         )
         ours = small_optimizer("gauss_newton", iterations=5, search=search)
-        for name, poses in (("ours", optimized_by(ours, head)), ("gtsam", pose_graph("gtsam", settings, head))):
+        for name, poses in (("ours", optimized_by(ours, head)), ("gtsam", pose_graph(settings, head))):
             errors[name, overlaps] = float(np.linalg.norm((poses(some) - truth)[..., :2], axis=-1).mean())
     for name in ("ours", "gtsam"):
         assert errors[name, 20] < 0.5 * errors[name, 0]
