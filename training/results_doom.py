@@ -22,7 +22,6 @@ from ngo_estimator.data.weights_file import load_description
 from ngo_estimator.frontend.camera.familiarity_watch import FamiliarityWatch
 from ngo_estimator.slam import online_trajectory
 from ngo_estimator.slam.online_trajectory import OnlineTrajectory
-from ngo_sim.episodes import Episode
 from training.baselines.graph_settings import load_settings
 from training.common.command_line import check_at_least, run_command
 from training.data.doom_drives import TEST_MAPS, TRAIN_MAPS, VALIDATION_MAPS, Map, map_drive
@@ -99,7 +98,7 @@ def map_name(of: Map) -> str:
 
 
 class Drives:
-    """Drives and what the networks make of them, kept in files below ``folder``."""
+    """Drives as ``local_node`` publishes them, each made once and kept in a file below ``folder``."""
 
     def __init__(self, weights: Path, arguments: Arguments) -> None:
         self.folder = arguments.runs / _WORLD / "results"
@@ -110,54 +109,40 @@ class Drives:
         self._watch = None if familiarity is None else FamiliarityWatch(familiarity, self.place.encoder)
         known = weights / f"{FAMILIARITY}.safetensors"
         watch = load_description(known, FAMILIARITY)["sha256"] if known.exists() else None
-        self._networks = json.dumps([described["sha256"], described_place["sha256"]])
-        self._identity = f"{self._networks} {watch}"
-        self._world: World = world_named(_WORLD)
-
-    def drive(self, of: Map, seed: int, drawn_start: bool = False) -> Episode:
-        """A drive, which is simulated once."""
-
-        def made() -> dict[str, np.ndarray]:
-            drive = map_drive(of, seed, self._frames, drawn_start=drawn_start)
-            return {"observations": drive.observations, "actions": drive.actions, "poses": drive.poses_xyyaw}
-
-        name = self._name(of, seed, drawn_start)
-        found = kept(self.folder / "drives" / f"{name}.npz", name, made)
-        return Episode(found["observations"], found["actions"], found["poses"], self._world.period_s, None)
+        self._identity = f"{json.dumps([described['sha256'], described_place['sha256']])} {watch}"
 
     def features(self, of: Map, seed: int, drawn_start: bool = False) -> Features:
-        """What the networks make of a drive."""
+        """What the networks make of a drive, its ``actions`` and ``poses``."""
 
         def made() -> Features:
-            drive = self.drive(of, seed, drawn_start)
-            features = features_of(self._world, drive, self._weights, (self.local, self.place))
+            world, drive = world_named(_WORLD), map_drive(of, seed, self._frames, drawn_start=drawn_start)
+            features = features_of(world, drive, self._weights, (self.local, self.place))
+            if self._watch is not None:
+                features = judged(self._watch, images_of(world, drive), drive.actions, features)
             return {"actions": drive.actions, "poses": drive.poses_xyyaw, **features}
 
         name = self._name(of, seed, drawn_start)
-        return kept(self.folder / f"{name}.npz", f"{name} {self._networks}", made)
+        return kept(self.folder / f"{name}.npz", f"{name} {self._identity}", made)
 
     def _name(self, of: Map, seed: int, drawn_start: bool) -> str:
         return f"{map_name(of)}-{seed}-{self._frames}{'-drawn' * drawn_start}"
 
-    def judged(self, of: Map, seed: int, features: Features) -> Features:
-        """The features with steps and deviations as ``local_node`` publishes them, and ``unlikeness`` ``(steps,)``."""
-        if self._watch is None:
-            return features
-        drive = self.drive(of, seed)
-        relative, log_std, motion = (torch.from_numpy(features[name]) for name in ("relative", "log_std", "motion"))
-        steps = relative, torch.exp(2.0 * log_std.double()), motion
-        found = self._watch.judge_drive(images_of(self._world, drive), drive.actions, steps)
-        return {
-            **features,
-            "relative": np.stack([one.relative for one in found]).astype(np.float32),
-            "log_std": 0.5 * np.log(np.stack([one.variance for one in found])),
-            "unlikeness": np.array([one.unlikeness for one in found]),
-        }
-
     def of_table(self, of: Map, seed: int) -> Drive:
-        """A drive of the table, which makes the features as they are judged."""
+        """A drive of the table."""
         name = self._name(of, seed, drawn_start=False)
-        return Drive(name, f"{name} {self._identity}", lambda: self.judged(of, seed, self.features(of, seed)))
+        return Drive(name, f"{name} {self._identity}", partial(self.features, of, seed))
+
+
+def judged(watch: FamiliarityWatch, images: torch.Tensor, actions: np.ndarray, features: Features) -> Features:
+    """The features with steps and deviations of frames that are judged, and ``unlikeness`` ``(steps,)``."""
+    relative, log_std, motion = (torch.from_numpy(features[name]) for name in ("relative", "log_std", "motion"))
+    found = watch.judge_drive(images, actions, (relative, torch.exp(2.0 * log_std.double()), motion))
+    return {
+        **features,
+        "relative": np.stack([one.relative for one in found]).astype(np.float32),
+        "log_std": 0.5 * np.log(np.stack([one.variance for one in found])),
+        "unlikeness": np.array([one.unlikeness for one in found]),
+    }
 
 
 def table_rows(arguments: Arguments, drives: Drives) -> dict[str, Row]:

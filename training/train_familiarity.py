@@ -22,7 +22,7 @@ import torch
 from torch import Tensor
 
 from ngo_estimator.checkpoint import FAMILIARITY, LOCAL, PLACE, load_local, load_place
-from ngo_estimator.frontend.camera.local_odometry import LocalEstimate, LocalOdometry
+from ngo_estimator.frontend.camera.local_odometry import LocalOdometry
 from ngo_estimator.geometry import se2
 from ngo_estimator.networks.familiarity import (
     DISTANCES,
@@ -246,22 +246,12 @@ def fit_disagreement(
     """
     if not drives:
         return familiarity.config.disagreement, {}
-    told = familiarity.config.is_told
-    runs_of: dict[str, list[tuple[np.ndarray, list[LocalEstimate], list[LocalEstimate]]]] = {
-        kind: [] for kind in FAULTS if told or kind not in _NEEDS_TOLD
-    }
-    cores = []
-    for factor in (1e-9, 1.0):  # variances are a sum: what does not depend on the factor, and its square times the rest
-        config = dataclasses.replace(familiarity.config, disagreement=factor)
-        cores.append(LocalOdometry(networks.local, networks.place, world, with_config(familiarity, config)))
-    for kind, found in runs_of.items():
-        for seed, drive in enumerate(drives):
-            bad = faulted(drive, kind, len(drive.poses_xyyaw) // 4, seed)
-            without, with_one = (estimates_of(core, bad) for core in cores)
-            found.append((seen_from_first(drive.poses_xyyaw)[1:], without, with_one))
+    kinds = [kind for kind in FAULTS if familiarity.config.is_told or kind not in _NEEDS_TOLD]
     shares: dict[str, float] = {}
     for factor in FACTORS:
-        shares = {kind: float(np.mean([_share(*run, factor) for run in found])) for kind, found in runs_of.items()}
+        config = dataclasses.replace(familiarity.config, disagreement=factor)
+        core = LocalOdometry(networks.local, networks.place, world, with_config(familiarity, config))
+        shares = {kind: float(np.mean([_share(core, *one, kind) for one in enumerate(drives)])) for kind in kinds}
         if min(shares.values()) >= _WANTED:
             return factor, shares
     return FACTORS[-1], shares
@@ -272,13 +262,10 @@ def dishonest(shares: dict[str, float]) -> str:
     return ", ".join(f"{kind} ({share:.1%})" for kind, share in shares.items() if share < _WANTED)
 
 
-def _share(truth: np.ndarray, without: list[LocalEstimate], with_one: list[LocalEstimate], factor: float) -> float:
-    steps = [
-        dataclasses.replace(a, covariance=a.covariance + factor**2 * (b.covariance - a.covariance))
-        for a, b in zip(without, with_one, strict=True)
-    ]
+def _share(core: LocalOdometry, seed: int, drive: SensedDrive, kind: str) -> float:
+    steps = estimates_of(core, faulted(drive, kind, len(drive.poses_xyyaw) // 4, seed))
     odometry = np.stack([step.odom_xyyaw for step in steps])
-    return within(odometry, odometry_covariances(odometry, steps), truth)
+    return within(odometry, odometry_covariances(odometry, steps), seen_from_first(drive.poses_xyyaw)[1:])
 
 
 if __name__ == "__main__":

@@ -22,7 +22,6 @@ from torch import Tensor
 from torch.utils.data import IterableDataset
 
 from ngo_estimator.checkpoint import LOCAL, load_local
-from ngo_estimator.geometry import se2
 from ngo_estimator.networks.local_pose_network import LocalPoseConfig, LocalPoseNetwork
 from ngo_recordings.errors import RecordingError
 from training.common import runs
@@ -38,7 +37,6 @@ from training.data.worlds import OPTIMIZER_TRAIN_SEEDS, TRAIN_SEEDS, VALIDATION_
 from training.recordings.recording_source import SourceArguments, inputs_of, open_source
 from training.recordings.recording_streams import RecordedSteps
 
-RPE_STEPS = 100
 CALIBRATION_MAZES = 64
 """Mazes that the output of a world's network is calibrated in."""
 
@@ -217,7 +215,7 @@ def main(arguments: Arguments) -> dict[str, float]:
     training.cpu()
     final = LocalPoseNetwork(calibrated(network, steps.unseen(), domain.deviation_steps)).eval()
     final.load_state_dict(network.state_dict())
-    metrics = measure(final, data.validation, RPE_STEPS if source.recorded is None else 0)
+    metrics = measure(final, data.validation)
     save_weights(arguments.out / domain.name, final, LOCAL, {**run.ended(metrics, begun), **source.about})
     return metrics
 
@@ -274,23 +272,10 @@ def _begun_network(folder: Path, domain: Domain, wanted: int) -> tuple[LocalPose
 
 
 @torch.no_grad()
-def measure(network: LocalPoseNetwork, pairs: list[Batch], rpe_steps: int = 0) -> dict[str, float]:
-    """``step_metrics`` of a network over episodes.
-
-    With ``rpe_steps`` also the relative pose error of its headings over so many steps (RMS, deg), of all such windows
-    in episodes; shorter ones are one window each. Where errors of single steps are independent, it is their RMS times
-    the root of the number of steps.
-    """
-    parts = [estimated(network, p)[:2] for p in pairs]
-    truth = torch.cat([p["relative"] for p in pairs])
-    metrics = step_metrics(torch.cat([p[0] for p in parts]), torch.cat([p[1] for p in parts]), truth)
-    if rpe_steps:
-        errors = [
-            se2.wrap(mean[:, 2] - p["relative"][:, 2]).double() for (mean, _), p in zip(parts, pairs, strict=True)
-        ]
-        drifts = [error.unfold(0, min(rpe_steps, len(error)), 1).sum(-1) for error in errors]
-        metrics[f"rpe_{rpe_steps}_deg"] = float(torch.cat(drifts).square().mean().sqrt().rad2deg())
-    return metrics
+def measure(network: LocalPoseNetwork, pairs: list[Batch]) -> dict[str, float]:
+    """``step_metrics`` of a network over episodes."""
+    mean, log_std, _ = (torch.cat(column) for column in zip(*(estimated(network, p) for p in pairs), strict=True))
+    return step_metrics(mean, log_std, torch.cat([p["relative"] for p in pairs]))
 
 
 if __name__ == "__main__":

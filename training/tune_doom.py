@@ -78,7 +78,7 @@ def main(arguments: Arguments) -> None:
     places = [(of, 10_000 + k) for of in VALIDATION_MAPS for k in range(arguments.seeds)]
     places += [(ROOMS, VALIDATION_SEEDS[k]) for k in range(2 * arguments.seeds)]
     places += [(MAZES, VALIDATION_SEEDS[FIRST_MAZE + k]) for k in range(FEWER)]
-    features = [drives.judged(*place, drives.features(*place)) for place in places]
+    features = [drives.features(*place) for place in places]
     odometry = np.array([error(local(one).poses, one) for one in features])
     pair_head = drives.place.pair_head
     best: tuple[float, NeuralGraphOptimizer] | None = None

@@ -19,6 +19,7 @@ from ngo_estimator.graph.relative_poses import RelativePoses
 from ngo_estimator.trajectory.chained_graph import chained
 from ngo_estimator.trajectory.g2o import read_g2o
 from training.baselines.lidar_peers import solve_with
+from training.scoring.metrics import absolute_error_m
 
 KINDS = ("random", "local", "grouped", "lookalike", "offset")
 """How loops are wrong: between any two nodes; near along the chain; in groups that agree; between long stretches that
@@ -51,10 +52,7 @@ class JudgedProblem:
 
     def ate_m(self, poses: np.ndarray) -> float:
         """Root mean square distance (m) of poses ``(nodes, 3)`` after the best alignment."""
-        mine, true = poses[:, :2] - poses[:, :2].mean(0), self.truth - self.truth.mean(0)
-        u, _, v = np.linalg.svd(mine.T @ true)
-        turn = u @ np.diag((1.0, np.sign(np.linalg.det(u @ v)))) @ v
-        return float(np.sqrt(((mine @ turn - true) ** 2).sum(1).mean()))
+        return absolute_error_m(poses, self.truth)
 
 
 def synthetic(kind: str, percent: float, nodes: int, metric: bool, seed: int, hard: bool = False) -> JudgedProblem:

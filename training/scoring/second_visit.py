@@ -7,6 +7,7 @@ from scipy.signal import fftconvolve
 from scipy.spatial import KDTree
 
 from ngo_estimator.geometry.planar_motion import Array, compose, rotated, transformed
+from training.scoring.metrics import rigid_motion
 
 STRETCH_M = 20.0
 """Way at the end of a drive that is the second visit."""
@@ -106,13 +107,5 @@ def _refined(tree: KDTree, cloud: Array, motion: Array) -> Array:
         near = away < most_m
         if near.sum() < 3:
             return motion
-        motion = compose(_rigid(moved[near], tree.data[index[near]]), motion)
+        motion = compose(rigid_motion(moved[near], tree.data[index[near]]), motion)
     return motion
-
-
-def _rigid(points: Array, wanted: Array) -> Array:
-    """The motion ``(3,)`` that moves points ``(n, 2)`` closest to others (Umeyama 1991, in the plane)."""
-    middle, target = points.mean(axis=0), wanted.mean(axis=0)
-    a, b = points - middle, wanted - target
-    yaw = np.arctan2((a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]).sum(), (a * b).sum())
-    return np.array((*(target - rotated(yaw, middle[None])[0]), yaw))

@@ -143,20 +143,6 @@ def test_a_component_that_was_not_learned_keeps_a_positive_deviation(network: Lo
     assert abs(measure(better, pairs)["bias_forward_m"]) < 1e-4
 
 
-def test_rpe_adds_up_errors_that_last_and_not_those_that_cancel(network: LocalPoseNetwork) -> None:
-    (pairs,) = pairs_with_truth(network, torch.ones(3), torch.zeros(3))
-
-    def off(by: Tensor) -> Batch:
-        return {**pairs, "relative": pairs["relative"] + by * torch.tensor([0.0, 0.0, 0.01])}
-
-    # One to the left and one to the right: a window of both would have less.
-    lasting = [off(torch.ones(200, 1)), off(-torch.ones(200, 1))]
-    assert measure(network, lasting, 50)["rpe_50_deg"] == pytest.approx(np.degrees(0.5), rel=1e-4)
-    assert measure(network, lasting, 300)["rpe_300_deg"] == pytest.approx(np.degrees(2.0), rel=1e-4)
-    cancelling = [off(torch.tensor([1.0, -1.0]).repeat(100)[:, None])]
-    assert measure(network, cancelling, 50)["rpe_50_deg"] == pytest.approx(0.0, abs=1e-3)
-
-
 def begun_with(folder: Path, **changes: Any) -> LocalPoseNetwork:
     arguments = Arguments(world="maze2d", recordings=RecordedArguments(from_weights=folder))
     world = dataclasses.replace(WORLDS["maze2d"], **changes)
