@@ -20,7 +20,7 @@ from ngo_estimator.loops.loop_closure import Loops
 from ngo_estimator.ngo.meta_poses import MetaSteps
 from ngo_estimator.nodes.path_message import PathWriter
 from ngo_estimator.slam.online_trajectory import OnlineTrajectory
-from training.baselines.pose_graph import xyyaw
+from training.baselines.graph_peers import xyyaw
 from training.common.records import WEIGHTS
 from training.data.episodes import images_of
 from training.data.worlds import world_named

@@ -12,7 +12,8 @@ import torch
 from ngo_estimator.geometry import se2
 from ngo_estimator.loops.loop_closure import Loops
 from ngo_estimator.ngo.meta_poses import MetaSteps
-from training.baselines.pose_graph import PoseGraphSettings, xyyaw
+from training.baselines.graph_peers import xyyaw
+from training.baselines.pose_graph import PoseGraphSettings
 
 SETTINGS = PoseGraphSettings()
 """How far odometry and loops are believed, and the robust kernel: those of the classical baseline."""

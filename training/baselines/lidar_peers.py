@@ -1,113 +1,15 @@
-"""Other ways to a lidar's trajectory, on the same scans: GTSAM on our steps and loops, and KISS-ICP.
-
-GTSAM solves the graph that our optimizer solves, with the same measurements and covariances. KISS-ICP (Vizzo et al.
-2023) has neither wheels nor loops; it is made for 3D, and gets a scan's points with z = 0.
-"""
+"""KISS-ICP (Vizzo et al. 2023) on a lidar's scans: it has neither wheels nor loops, and gets points with z = 0."""
 
 import math
 from dataclasses import dataclass
-from typing import Any
 
-import gtsam
 import numpy as np
 
-from ngo_estimator.data.configuration import check, check_positive
+from ngo_estimator.data.configuration import check_positive
 from ngo_estimator.geometry.scan_points import Mounting
-from ngo_estimator.graph.relative_poses import RelativePoses
 from ngo_recordings.scan_stream import LidarScan
 
-_ANCHOR_STD = 1e-6
-_TOLERANCE = 1e-6
 _LEAST_POINTS = 3
-
-
-@dataclass(frozen=True)
-class GraphPeerConfig:
-    """How GTSAM solves a graph of key scans.
-
-    ``cauchy`` is the width of the Cauchy kernel in deviations, on loops and with ``robust_steps`` on steps;
-    ``inlier_probability`` is the one at which graduated non-convexity (Yang et al. 2020) takes a loop for right, under
-    truncated least squares.
-    """
-
-    cauchy: float = 3.0
-    robust_steps: bool = True
-    inlier_probability: float = 0.99
-
-    def __post_init__(self) -> None:
-        check_positive(self, "cauchy")
-        check(self, "inlier_probability", "between 0 and 1", lambda x: 0.0 < x < 1.0)
-
-
-def solve_lm(steps: RelativePoses, loops: RelativePoses, start: np.ndarray, config: GraphPeerConfig) -> np.ndarray:
-    """Poses ``(nodes, 3)`` by Levenberg-Marquardt with Cauchy kernels, from ``start`` ``(nodes, 3)``."""
-    return solve_with(
-        gtsam.noiseModel.mEstimator.Cauchy.Create(config.cauchy), steps, loops, start, config.robust_steps
-    )
-
-
-def solve_with(
-    kernel: Any | None, steps: RelativePoses, loops: RelativePoses, start: np.ndarray, robust_steps: bool = False
-) -> np.ndarray:
-    """Poses ``(nodes, 3)`` by Levenberg-Marquardt with one of GTSAM's kernels, or with none: least squares."""
-    graph = gtsam.NonlinearFactorGraph()
-    _anchor(graph, start)
-    _add(graph, steps, kernel if robust_steps else None)
-    _add(graph, loops, kernel)
-    return _poses(gtsam.LevenbergMarquardtOptimizer(graph, _values(start), _lm()).optimize())
-
-
-def solve_gnc(steps: RelativePoses, loops: RelativePoses, start: np.ndarray, config: GraphPeerConfig) -> np.ndarray:
-    """Poses ``(nodes, 3)`` by graduated non-convexity, with every step for an inlier, from ``start`` ``(nodes, 3)``."""
-    graph = gtsam.NonlinearFactorGraph()
-    _anchor(graph, start)
-    _add(graph, steps, None)
-    trusted = graph.size()
-    _add(graph, loops, None)
-    if graph.size() == trusted:
-        return start.copy()
-    parameters = gtsam.GncLMParams(_lm())
-    parameters.setLossType(gtsam.GncLossType.TLS)
-    parameters.setKnownInliers(list(range(trusted)))
-    optimizer = gtsam.GncLMOptimizer(graph, _values(start), parameters)
-    optimizer.setInlierCostThresholdsAtProbability(config.inlier_probability)
-    return _poses(optimizer.optimize())
-
-
-def _lm() -> gtsam.LevenbergMarquardtParams:
-    parameters = gtsam.LevenbergMarquardtParams()
-    parameters.setRelativeErrorTol(_TOLERANCE)
-    parameters.setAbsoluteErrorTol(_TOLERANCE)
-    return parameters
-
-
-def _anchor(graph: gtsam.NonlinearFactorGraph, start: np.ndarray) -> None:
-    noise = gtsam.noiseModel.Isotropic.Sigma(3, _ANCHOR_STD)
-    graph.add(gtsam.PriorFactorPose2(0, gtsam.Pose2(*start[0]), noise))
-
-
-def _add(graph: gtsam.NonlinearFactorGraph, measured: RelativePoses, kernel: Any | None) -> None:
-    # GTSAM's residual of a between factor lies in the frame of the measured pose, ours along the axes of the first one.
-    cosine, sine = np.cos(measured.relative[:, 2]), np.sin(measured.relative[:, 2])
-    turn = np.zeros((len(measured.nodes), 3, 3))
-    turn[:, 0, 0], turn[:, 0, 1], turn[:, 1, 0], turn[:, 1, 1], turn[:, 2, 2] = cosine, -sine, sine, cosine, 1.0
-    roots = measured.root @ turn
-    for (first, second), relative, root in zip(measured.nodes.tolist(), measured.relative, roots, strict=True):
-        noise: Any = gtsam.noiseModel.Gaussian.Information(root.T @ root)
-        if kernel is not None:
-            noise = gtsam.noiseModel.Robust.Create(kernel, noise)
-        graph.add(gtsam.BetweenFactorPose2(first, second, gtsam.Pose2(*relative), noise))
-
-
-def _values(poses: np.ndarray) -> gtsam.Values:
-    values = gtsam.Values()
-    for node, pose in enumerate(poses):
-        values.insert(node, gtsam.Pose2(*pose))
-    return values
-
-
-def _poses(values: gtsam.Values) -> np.ndarray:
-    return np.asarray(gtsam.utilities.extractPose2(values))
 
 
 @dataclass(frozen=True)

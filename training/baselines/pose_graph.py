@@ -17,6 +17,7 @@ from ngo_estimator.data.configuration import check, check_positive
 from ngo_estimator.geometry import se2
 from ngo_estimator.loops.loop_closure import LoopSearch
 from ngo_estimator.ngo.pose_aggregation import block_variances, frame_poses, poses_in_blocks
+from training.baselines.graph_peers import values, xyyaw
 from training.baselines.loop_factors import LoopFactors, MoreLoops
 
 Kernel = Literal["none", "huber", "cauchy", "geman_mcclure", "dcs"]
@@ -131,18 +132,15 @@ class _Graph:
         return xyyaw(self._loop_closed())
 
     def _loop_closed(self) -> gtsam.Values:
-        values = gtsam.Values()
-        for node, pose in enumerate(self._odometry):
-            values.insert(node, gtsam.Pose2(*pose))
-        settings = self._settings
+        settings, found = self._settings, values(self._odometry)
         last = settings.kernel, settings.kernel_width
         if settings.drift_m == 0.0 or settings.kernel == "none":
             stages = [(*kernel, 0.0) for kernel in dict.fromkeys((self._convex, last))]
         else:
             stages = [(*self._convex, settings.drift_m), *((*last, settings.drift_m * share) for share in _DRIFT_LEFT)]
         for stage in stages:
-            values = _minimum(self._with_loops(*stage), values)
-        return values
+            found = _minimum(self._with_loops(*stage), found)
+        return found
 
     def _with_loops(self, kernel: Kernel, width: float, drift_m: float = 0.0) -> gtsam.NonlinearFactorGraph:
         graph = self._base.clone()
@@ -175,8 +173,3 @@ def _minimum(graph: gtsam.NonlinearFactorGraph, start: gtsam.Values) -> gtsam.Va
     parameters.setRelativeErrorTol(1e-4)
     parameters.setAbsoluteErrorTol(1e-4)
     return gtsam.LevenbergMarquardtOptimizer(graph, start, parameters).optimize()
-
-
-def xyyaw(values: gtsam.Values) -> np.ndarray:
-    """Poses ``(nodes, 3)`` in the order of the nodes."""
-    return np.asarray(gtsam.utilities.extractPose2(values))

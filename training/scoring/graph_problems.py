@@ -18,7 +18,7 @@ from ngo_estimator.graph.cycle_agreement import chain_poses
 from ngo_estimator.graph.relative_poses import RelativePoses
 from ngo_estimator.trajectory.chained_graph import chained
 from ngo_estimator.trajectory.g2o import read_g2o
-from training.baselines.lidar_peers import solve_with
+from training.baselines.graph_peers import least_squares
 from training.scoring.metrics import absolute_error_m
 
 KINDS = ("random", "local", "grouped", "lookalike", "offset")
@@ -193,7 +193,7 @@ def manhattan(folder: Path, kind: str, percent: float, seed: int) -> JudgedProbl
     """Manhattan3500 with wrong loops, ``percent`` of all; the truth is its solution with its own loops."""
     own = chained(read_g2o(folder / "manhattan3500.g2o.gz")).problem
     steps, right, start = own.steps, own.loops, chain_poses(own.steps.relative)
-    true = solve_with(None, steps, right, start)
+    true = least_squares(GraphProblem(start, steps, right, np.ones(len(right))))
     rng = np.random.default_rng((seed, KINDS.index(kind), round(percent)))
     loops = with_wrong(right, true, kind, percent, rng)
     problem = GraphProblem(start, steps, loops, np.ones(len(loops)))

@@ -20,16 +20,20 @@ from ngo_estimator.frontend.lidar import mixture_lidar
 from ngo_estimator.frontend.lidar.mixture_config import read_mixture_config
 from ngo_estimator.frontend.lidar.mixture_lidar import MixtureLidar
 from ngo_estimator.geometry.planar_motion import chained
+from ngo_estimator.graph.corrector import GraphProblem
+from ngo_estimator.graph.relative_poses import RelativePoses
+from ngo_estimator.graph.robust import Robust
 from ngo_estimator.loops.scan_settings import ScanGraphConfig
 from ngo_estimator.slam import scan_trajectory
 from ngo_estimator.slam.scan_trajectory import ScanTrajectory
 from ngo_estimator.slam.trajectory_update import Trajectory
 from ngo_recordings.scan_stream import WheelPose
-from training.baselines import lidar_peers
-from training.baselines.lidar_peers import GraphPeerConfig, KissConfig
+from training.baselines import graph_peers, lidar_peers
+from training.baselines.graph_peers import Peer
+from training.baselines.lidar_peers import KissConfig
 from training.data.lidar_drives import LidarDrive
 from training.scoring import wrong_loops
-from training.scoring.wrong_loops import Solver, WrongLoopsConfig, solve_ours, with_wrong_loops
+from training.scoring.wrong_loops import WrongLoopsConfig, with_wrong_loops
 
 _MOST_WALL_POINTS = 60_000  # of a picture
 _PIPELINE = (mixture_lidar, scan_trajectory)
@@ -181,31 +185,32 @@ def ours(runs: DriveRuns, pipeline: Pipeline) -> Estimate:
     )
 
 
-def graph_peer(runs: DriveRuns, solve: Solver, config: GraphPeerConfig) -> Estimate:
+def graph_peer(runs: DriveRuns, solve: Peer) -> Estimate:
     """Another solver on the steps and the loops of our own run, from its odometry."""
     run = runs.run(Pipeline())
     back_end = run.online.back_end
-    steps, loops = back_end.measurements()
+    problem = _problem(*back_end.measurements())
     began = time.process_time()
-    nodes = solve(steps, loops, chained(steps.relative), config)
-    seconds = time.process_time() - began
+    nodes = solve(problem)
+    facts = {"solver_s": time.process_time() - began, "loops": len(problem.loops)}
     poses = back_end.graph.frame_poses(nodes=nodes)
-    facts = {"solver_s": seconds, "loops": len(loops.nodes)}
     return Estimate(run.trajectory.stamps_ns, poses, odometry=run.trajectory.odometry_xyyaw, facts=facts)
 
 
-def fed_with_wrong_loops(
-    runs: DriveRuns, solve: Solver, config: GraphPeerConfig, wrong: WrongLoopsConfig
-) -> list[Estimate]:
+def fed_with_wrong_loops(runs: DriveRuns, solve: Peer, wrong: WrongLoopsConfig) -> list[Estimate]:
     """A solver on the steps and the loops of our own run and wrong loops, one estimate for each seed of these."""
     run = runs.run(Pipeline())
     steps, loops = run.online.back_end.measurements()
-    start, estimates = chained(steps.relative), []
+    estimates = []
     for seed in wrong.seeds:
-        fed = with_wrong_loops(loops, len(start), wrong.percent, np.random.default_rng(seed))
-        poses = run.online.back_end.graph.frame_poses(nodes=solve(steps, fed, start, config))
+        fed = with_wrong_loops(loops, len(steps) + 1, wrong.percent, np.random.default_rng(seed))
+        poses = run.online.back_end.graph.frame_poses(nodes=solve(_problem(steps, fed)))
         estimates.append(Estimate(run.trajectory.stamps_ns, poses, odometry=run.trajectory.odometry_xyyaw))
     return estimates
+
+
+def _problem(steps: RelativePoses, loops: RelativePoses) -> GraphProblem:
+    return GraphProblem(chained(steps.relative), steps, loops, np.ones(len(loops)))
 
 
 def wheels_alone(runs: DriveRuns) -> Estimate:
@@ -246,19 +251,22 @@ def _ours(ablation: bool = False, **changes: Any) -> Row:
     return Row(partial(ours, pipeline=pipeline), pipeline, ablation=ablation)
 
 
-def _gtsam(solve: Solver) -> Row:
-    config = GraphPeerConfig()
-    return Row(partial(graph_peer, solve=solve, config=config), config, code=(*_PIPELINE, lidar_peers))
+def _gtsam(solve: Peer) -> Row:
+    return Row(partial(graph_peer, solve=solve), None, code=(*_PIPELINE, graph_peers))
 
 
-def _fed(solve: Solver, percent: float) -> Row:
-    config, wrong = GraphPeerConfig(), WrongLoopsConfig(percent)
+def _fed(name: str, solve: Peer, percent: float) -> Row:
+    wrong = WrongLoopsConfig(percent)
     return Row(
-        partial(fed_with_wrong_loops, solve=solve, config=config, wrong=wrong),
-        {"solver": dataclasses.asdict(config), "wrong": dataclasses.asdict(wrong)},
-        code=(*_PIPELINE, lidar_peers, wrong_loops),
+        partial(fed_with_wrong_loops, solve=solve, wrong=wrong),
+        {"solver": name, "wrong": dataclasses.asdict(wrong)},
+        code=(*_PIPELINE, graph_peers, wrong_loops),
         ablation=True,
     )
+
+
+def _robust(problem: GraphProblem) -> np.ndarray:
+    return Robust().correct(problem).poses
 
 
 def _kiss_missing() -> str:
@@ -269,17 +277,17 @@ ROWS: dict[str, Row] = {
     "wheels": Row(wheels_alone, None, needs_wheels=True, code=()),
     "ours": _ours(),
     "ours_without_wheels": _ours(wheels=False),
-    "gtsam_lm": _gtsam(lidar_peers.solve_lm),
-    "gtsam_gnc": _gtsam(lidar_peers.solve_gnc),
+    "gtsam_lm": _gtsam(graph_peers.cauchy_on_all),
+    "gtsam_gnc": _gtsam(graph_peers.gnc),
     "kiss_icp": Row(partial(kiss, config=KissConfig()), KissConfig(), code=(lidar_peers,), missing=_kiss_missing),
     "without_agreement": _ours(True, graph={"loops.least_agreeing": 0, "loops.agreeing_per_deviation": 0.0}),
     **{
-        f"{name}_{percent}_percent_wrong": _fed(solve, percent)
+        f"{name}_{percent}_percent_wrong": _fed(name, solve, percent)
         for percent in (10, 30, 60)
         for name, solve in (
-            ("ours", solve_ours),
-            ("gtsam_lm", lidar_peers.solve_lm),
-            ("gtsam_gnc", lidar_peers.solve_gnc),
+            ("ours", _robust),
+            ("gtsam_lm", graph_peers.cauchy_on_all),
+            ("gtsam_gnc", graph_peers.gnc),
         )
     },
 }

@@ -1,19 +1,14 @@
-"""Wrong loops fed into a graph, as places that look alike give them, and who still finds the trajectory."""
+"""Wrong loops fed into a graph, as places that look alike give them."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from ngo_estimator.data.configuration import check
-from ngo_estimator.graph.corrector import GraphProblem
 from ngo_estimator.graph.relative_poses import RelativePoses
-from ngo_estimator.graph.robust import Robust
-from training.baselines.lidar_peers import GraphPeerConfig
 
 _GROUP = 5
-
-Solver = Callable[[RelativePoses, RelativePoses, np.ndarray, GraphPeerConfig], np.ndarray]
 
 
 @dataclass(frozen=True)
@@ -48,8 +43,3 @@ def with_wrong_loops(loops: RelativePoses, nodes: int, percent: float, rng: np.r
         np.concatenate((loops.relative, loops.relative[rows][kept])),
         np.concatenate((loops.root, loops.root[rows][kept])),
     )
-
-
-def solve_ours(steps: RelativePoses, loops: RelativePoses, start: np.ndarray, config: GraphPeerConfig) -> np.ndarray:
-    """Poses ``(nodes, 3)`` by our own robust corrector, from ``start``; it takes nothing of ``config``."""
-    return Robust().correct(GraphProblem(start, steps, loops, np.ones(len(loops)))).poses

@@ -11,7 +11,8 @@ from ngo_estimator.graph.corrector import GraphProblem
 from ngo_estimator.graph.relative_poses import RelativePoses
 from ngo_estimator.graph.robust import Robust
 from ngo_recordings.scan_stream import LidarScan
-from training.baselines.lidar_peers import GraphPeerConfig, scan_points, solve_gnc, solve_lm
+from training.baselines.graph_peers import Peer, cauchy_on_all, gnc, least_squares
+from training.baselines.lidar_peers import scan_points
 
 NODES = 40
 
@@ -44,19 +45,19 @@ def graph(seed: int = 0, wrong: int = 0) -> tuple[RelativePoses, RelativePoses, 
 
 def test_gtsam_finds_the_optimum_of_our_own_graph() -> None:
     steps, loops, start, _ = graph()
-    ours = Robust().correct(GraphProblem(start, steps, loops, np.ones(len(loops))))
-    assert (ours.loop_weights == 1.0).all()  # no loop is wrong: a kernel as wide as none has the same optimum
-    theirs = solve_lm(steps, loops, start, GraphPeerConfig(cauchy=1e6))
+    problem = GraphProblem(start, steps, loops, np.ones(len(loops)))
+    ours = Robust().correct(problem)
+    assert (ours.loop_weights == 1.0).all()  # no loop is wrong
+    theirs = least_squares(problem)
     np.testing.assert_allclose(theirs[:, :2], ours.poses[:, :2], atol=5e-4)
     off = np.remainder(theirs[:, 2] - ours.poses[:, 2] + math.pi, 2.0 * math.pi) - math.pi
     np.testing.assert_allclose(off, 0.0, atol=5e-4)
 
 
-@pytest.mark.parametrize("solve", [solve_lm, solve_gnc])
-def test_a_wrong_loop_does_little(solve: object) -> None:
+@pytest.mark.parametrize("solve", [cauchy_on_all, gnc])
+def test_a_wrong_loop_does_little(solve: Peer) -> None:
     steps, loops, start, truth = graph(wrong=1)
-    config = GraphPeerConfig()
-    poses = solve(steps, loops, start, config)  # type: ignore[operator]
+    poses = solve(GraphProblem(start, steps, loops, np.ones(len(loops))))
     assert np.abs(poses[:, :2] - truth[:, :2]).max() < 0.5
     assert np.abs(poses[-1, :2] - truth[-1, :2]).max() < np.abs(start[-1, :2] - truth[-1, :2]).max() + 0.05
 

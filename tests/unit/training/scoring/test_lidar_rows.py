@@ -10,14 +10,16 @@ from scipy.stats import multivariate_normal
 
 from ngo_estimator.frontend.lidar.mixture_config import MixtureConfig
 from ngo_estimator.geometry.scan_points import Mounting
+from ngo_estimator.graph.corrector import GraphProblem
 from ngo_estimator.graph.relative_poses import RelativePoses
+from ngo_estimator.graph.robust import Robust
 from ngo_recordings.scan_stream import LidarScan, WheelPose
-from training.baselines.lidar_peers import GraphPeerConfig, solve_lm
+from training.baselines.graph_peers import least_squares
 from training.data.lidar_drives import LidarDrive, ReferencePoses, Relations, TruePoses
 from training.scoring.lidar_errors import absolute_error_m, covariance_errors, lidar_errors
 from training.scoring.lidar_rows import FRONT_ABLATION, ROWS, DriveRuns, Estimate, Row, changed, identity_of
 from training.scoring.lidar_scores import scored, scored_rows
-from training.scoring.wrong_loops import solve_ours, with_wrong_loops
+from training.scoring.wrong_loops import with_wrong_loops
 
 POSES = np.stack((np.arange(5.0), np.zeros(5), np.zeros(5)), axis=-1)
 STAMPS = (1 + np.arange(5)) * 10**9
@@ -176,9 +178,9 @@ def test_right_loops_stay_and_wrong_ones_are_a_share_of_all(percent: float, wron
 def test_our_corrector_withstands_wrong_loops_and_least_squares_do_not(percent: float) -> None:
     fed = with_wrong_loops(LOOPS, NODES, percent, np.random.default_rng(2))
     start = TRUTH + np.linspace(0.0, 0.1, NODES)[:, None] * (1.0, 1.0, 0.1)
-    config = GraphPeerConfig(cauchy=1e6)
-    assert np.abs(solve_ours(STEPS, fed, start, config) - TRUTH).max() < 0.05
-    assert np.abs(solve_lm(STEPS, fed, start, config) - TRUTH).max() > 1.0
+    problem = GraphProblem(start, STEPS, fed, np.ones(len(fed)))
+    assert np.abs(Robust().correct(problem).poses - TRUTH).max() < 0.05
+    assert np.abs(least_squares(problem) - TRUTH).max() > 1.0
 
 
 @pytest.mark.parametrize("row", FRONT_ABLATION)
