@@ -14,6 +14,7 @@ from std_msgs.msg import Header
 
 from demo.graph import free_domain_id
 from ngo_estimator.nodes.listening import Listening
+from ngo_estimator.nodes.settings import NgoNodeSettings
 from ngo_estimator.nodes.status import NodeStatus
 
 _TIMEOUT_S = 30.0
@@ -32,7 +33,7 @@ def node() -> Iterator[Node]:
 @pytest.mark.parametrize(("at_once", "expected"), [(1, [1, 1, 1, 1, 1, 1]), (4, [4, 2])])
 def test_messages_that_wait_are_taken_together(node: Node, at_once: int, expected: list[int]) -> None:
     taken: list[int] = []
-    status = NodeStatus(node, "diagnostics", 1000.0, dict)
+    status = NodeStatus(node, NgoNodeSettings(diagnostics_period_s=60.0), dict)
     listening = Listening(node, status, 10.0)
     listening.to(Header, "header", lambda message: taken.append(message.stamp.sec), QoSProfile(depth=10), None, at_once)
     publisher = node.create_publisher(Header, "header", 10)

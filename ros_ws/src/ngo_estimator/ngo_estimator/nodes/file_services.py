@@ -31,6 +31,8 @@ if TYPE_CHECKING:
 
 Result = TypeVar("Result")
 Written = tuple[np.ndarray, np.ndarray | None]
+Service = tuple[Any, str, Callable[..., Any]]
+_QOS = QoSProfile(depth=1000)  # every call is answered, many at once as well
 
 
 class FileServices:
@@ -56,16 +58,16 @@ class FileServices:
         self._node, self._settings, self._folder = node, settings, Path(settings.save_directory)
         self._trajectories, self._graph = trajectories, graph
 
-    def open(self, qos: QoSProfile, built: ExitStack) -> None:
-        """Offer the services, until ``built`` is closed."""
+    def open(self, built: ExitStack, *others: Service) -> None:
+        """Offer the services and others, until ``built`` is closed."""
         self._thread = built.enter_context(ThreadPoolExecutor(1))
-        for kind, name, callback in self._services():
-            # A group of its own: while a file is written, the others go on.
-            group = MutuallyExclusiveCallbackGroup()
-            service = self._node.create_service(kind, name, callback, qos_profile=qos, callback_group=group)
+        # Each in a group of its own: while a file is written, the others go on.
+        own = [(MutuallyExclusiveCallbackGroup(), service) for service in self._services()]
+        for group, (kind, name, callback) in (*own, *((None, service) for service in others)):
+            service = self._node.create_service(kind, name, callback, qos_profile=_QOS, callback_group=group)
             built.callback(self._node.destroy_service, service)
 
-    def _services(self) -> Iterator[tuple[Any, str, Callable[..., Any]]]:
+    def _services(self) -> Iterator[Service]:
         yield SaveTrajectory, "~/save_trajectory", self._on_save_trajectory
         yield SaveGraph, "~/save_graph", self._on_save_graph
 
@@ -125,7 +127,7 @@ class StateServices(FileServices):
         self._session, self._take = session, take
         self._newest = self._folder  # the state that was loaded or saved last
 
-    def _services(self) -> Iterator[tuple[Any, str, Callable[..., Any]]]:
+    def _services(self) -> Iterator[Service]:
         yield from super()._services()
         yield SaveState, "~/save_state", self._on_save_state
         yield LoadState, "~/load_state", self._on_load_state

@@ -3,6 +3,7 @@
 from collections.abc import Callable, Hashable
 from typing import Any
 
+from ngo_msgs.msg import RelativePose
 from rclpy.callback_groups import CallbackGroup
 from rclpy.event_handler import SubscriptionEventCallbacks
 from rclpy.node import Node
@@ -12,7 +13,12 @@ from rclpy.topic_endpoint_info import TopicEndpointInfo
 from ngo_common.nodes.qos import overridable
 from ngo_common.waiting import waiting_messages
 from ngo_estimator.frontend.source_guard import SourceGuard
+from ngo_estimator.nodes.messages import to_ns
+from ngo_estimator.nodes.settings import NgoNodeSettings
 from ngo_estimator.nodes.status import NodeStatus
+
+AT_ONCE = 8
+"""Relative poses that are taken in one turn of the executor where a node fell behind."""
 
 # The graph learns of a publisher before it learns its node's name: nothing is said before that.
 _UNKNOWN = "a node of a name not known yet"
@@ -142,6 +148,18 @@ class Input:
             for info in self._publishers()
         ]
         return sorted((name, _plain(reason)) for name, fits, reason in checked if fits == QoSCompatibility.ERROR)
+
+
+def relative_poses(
+    node: Node, status: NodeStatus, settings: NgoNodeSettings, take: Callable[[RelativePose], None]
+) -> Input:
+    """The relative poses of one robot, of which several are taken where the node fell behind."""
+    topic, depth, timeout_s = settings.relative_pose_topic, settings.relative_pose_depth, settings.source_timeout_s
+    return Input(node, status, RelativePose, topic, depth, take, _origin, timeout_s, at_once=AT_ONCE)
+
+
+def _origin(message: RelativePose) -> int:
+    return to_ns(message.origin_stamp)
 
 
 def _plain(reason: str) -> str:

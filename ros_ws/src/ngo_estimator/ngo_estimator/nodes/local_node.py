@@ -81,9 +81,7 @@ class LocalNode(Node):
 
     def _create_topics(self) -> None:
         settings = self._settings
-        self._status = NodeStatus(
-            self, settings.diagnostics_topic, settings.diagnostics_period_s, self._details, self._problems
-        )
+        self._status = NodeStatus(self, settings, self._details, self._problems)
         self._relative_pose = self._publisher(RelativePose, settings.relative_pose_topic, settings.relative_pose_depth)
         odom_frame, base_frame = settings.framed(settings.odom_frame), settings.framed(settings.base_frame)
         if settings.publish_odometry and not self._has_odom:

@@ -21,7 +21,7 @@ from ngo_estimator.mapping.map_files import FREE, OCCUPIED, write_map
 from ngo_estimator.mapping.occupancy_grid import MapTooLarge, OccupancyMap
 from ngo_estimator.mapping.scan_map import ScanMap, ScanMapConfig, together, warm_up
 from ngo_estimator.mapping.scan_source import ScanSource, scan_source
-from ngo_estimator.nodes.inputs import Input, OnDemand
+from ngo_estimator.nodes.inputs import AT_ONCE, Input, OnDemand
 from ngo_estimator.nodes.listening import Listening
 from ngo_estimator.nodes.map_layer import MapLayer
 from ngo_estimator.nodes.map_publisher import MapPublisher
@@ -34,7 +34,6 @@ from ngo_estimator.trajectory.save_path import folder_inside, path_inside
 
 NAME = "ngo_map"
 _SUMMARY = "Publishes a map from the ranges in relative poses, at their corrected poses."
-_AT_ONCE = 8  # relative poses that are taken where the node fell behind
 _BUDGET_S = 0.35  # of an update, for scans that the trajectory moved; the rest is moved by the next one
 
 
@@ -84,9 +83,7 @@ class NgoMap(Node):
         self.get_logger().info(f"loaded {self._only.waiting} scans from {folder}: they wait for their trajectory")
 
     def _create_topics(self, settings: MapNodeSettings) -> None:
-        self._status = NodeStatus(
-            self, settings.diagnostics_topic, settings.diagnostics_period_s, self._details, self._problems
-        )
+        self._status = NodeStatus(self, settings, self._details, self._problems)
         self._publisher = MapPublisher(self, settings.map_topic, settings.framed(settings.map_frame))
         self._listening = Listening(self, self._status, settings.source_timeout_s)
         steps = QoSProfile(depth=settings.relative_pose_depth)
@@ -98,7 +95,7 @@ class NgoMap(Node):
             topics = settings.relative_pose_topic, settings.trajectory_topic
             poses, whole = (of_robot(robot, topic) if robot else topic for topic in topics)
             take, follow = partial(self._on_relative_pose, layer), partial(self._on_trajectory, layer)
-            self._listening.to(RelativePose, poses, take, steps, at_once=_AT_ONCE)
+            self._listening.to(RelativePose, poses, take, steps, at_once=AT_ONCE)
             self._newest.append(self._listening.to(Trajectory, whole, follow, newest, OnDemand()))
 
     @property

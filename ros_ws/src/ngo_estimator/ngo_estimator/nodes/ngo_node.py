@@ -11,7 +11,6 @@ from geometry_msgs.msg import PoseWithCovarianceStamped
 from ngo_msgs.msg import RelativePose
 from ngo_msgs.srv import RemoveLoop, Reset
 from rclpy.clock import Clock, ClockType
-from rclpy.qos import QoSProfile
 from std_srvs.srv import SetBool
 
 from ngo_common.nodes.parameters import LiveSettings
@@ -22,7 +21,7 @@ from ngo_estimator.geometry.planar_covariance import position_std
 from ngo_estimator.nodes import messages
 from ngo_estimator.nodes.code_memory import release_code
 from ngo_estimator.nodes.file_services import StateServices
-from ngo_estimator.nodes.inputs import Input
+from ngo_estimator.nodes.inputs import Input, relative_poses
 from ngo_estimator.nodes.loop_removal import remove_loops
 from ngo_estimator.nodes.managed_node import ManagedNode
 from ngo_estimator.nodes.pose_publisher import PosePublisher
@@ -46,8 +45,6 @@ if TYPE_CHECKING:
 
 NAME = "ngo_node"
 _DEPTH = 100
-_SERVICES = QoSProfile(depth=1000)  # every call is answered, many at once as well
-_AT_ONCE = 8  # relative poses that are taken where the node fell behind
 _PENDING_S = 1.0
 _SEARCH_LINE_S = 10.0
 _STARTS = 80  # relative poses until compiled functions are loaded
@@ -112,32 +109,21 @@ class NgoNode(ManagedNode):
         self._begin_anew()
         self._configured = True
         built.callback(setattr, self, "_configured", False)
-        self._files = files = StateServices(
-            self,
-            settings,
-            self._trajectories,
-            self._graph,
-            self._session,
-            self._take,
-        )
+        self._files = files = StateServices(self, settings, self._trajectories, self._graph, self._session, self._take)
         if settings.state:
             try:
                 files.load_at_start(settings.state, settings.relocalises)
             except ValueError as error:
                 raise StartError(f"state: {error}") from error
-        files.open(_SERVICES, built)
-        for kind, name, callback in (
+        files.open(
+            built,
             (Reset, "~/reset", self._on_reset),
             (SetBool, "~/pause", self._on_pause),
             (RemoveLoop, "~/remove_loop", self._on_remove_loop),
-        ):
-            service = self.create_service(kind, name, callback, qos_profile=_SERVICES)
-            built.callback(self.destroy_service, service)
+        )
 
     def _create_outputs(self, settings: NgoNodeSettings, smoothing: "SmoothedCorrection") -> None:
-        self._status = NodeStatus(
-            self, settings.diagnostics_topic, settings.diagnostics_period_s, self._details, self._problems
-        )
+        self._status = NodeStatus(self, settings, self._details, self._problems)
         self._status.idle = "inactive"
         self._built.callback(self._status.close)
         self._out = PosePublisher(self, lambda: self._settings, smoothing, self._built)
@@ -150,17 +136,7 @@ class NgoNode(ManagedNode):
             self._fleet.listen(listening)
             return
         with checked_overrides():
-            steps = Input(
-                self,
-                self._status,
-                RelativePose,
-                settings.relative_pose_topic,
-                settings.relative_pose_depth,
-                self._on_relative_pose,
-                lambda message: messages.to_ns(message.origin_stamp),
-                settings.source_timeout_s,
-                at_once=_AT_ONCE,
-            )
+            steps = relative_poses(self, self._status, settings, self._on_relative_pose)
             listening.callback(steps.close)
             initial = self.create_subscription(
                 PoseWithCovarianceStamped,

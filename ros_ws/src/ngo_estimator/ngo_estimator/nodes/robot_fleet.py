@@ -11,7 +11,6 @@ from ngo_msgs.msg import RelativePose
 from ngo_msgs.srv import RemoveLoop, Reset
 from rclpy.clock import Clock, ClockType
 from rclpy.lifecycle import LifecycleNode
-from rclpy.qos import QoSProfile
 from std_srvs.srv import SetBool
 
 from ngo_common.nodes.process import StartError
@@ -19,7 +18,7 @@ from ngo_common.nodes.qos import checked_overrides
 from ngo_estimator.geometry.planar_covariance import position_std
 from ngo_estimator.nodes import messages
 from ngo_estimator.nodes.file_services import FileServices
-from ngo_estimator.nodes.inputs import Input
+from ngo_estimator.nodes.inputs import Input, relative_poses
 from ngo_estimator.nodes.loop_removal import remove_loops
 from ngo_estimator.nodes.pose_publisher import PosePublisher
 from ngo_estimator.nodes.settings import TOPICS_OF_ROBOTS, NgoNodeSettings, of_robot
@@ -34,8 +33,6 @@ if TYPE_CHECKING:  # torch takes seconds: a bad parameter is said at once
     from ngo_estimator.slam.trajectory_update import Trajectory
     from ngo_estimator.trajectory.g2o import PlanarGraph
 
-_SERVICES = QoSProfile(depth=1000)
-_AT_ONCE = 8  # relative poses of a robot that are taken where the node fell behind
 _PENDING_S = 1.0
 
 
@@ -84,38 +81,24 @@ class RobotFleet:
         self._paused = False
         self._inputs: list[Input] = []
         with checked_overrides():
-            self._status = NodeStatus(
-                node, settings.diagnostics_topic, settings.diagnostics_period_s, self._details, self._problems
-            )
+            self._status = NodeStatus(node, settings, self._details, self._problems)
             built.callback(self._status.close)
             self._robots = {name: _Robot(self, name, built) for name in settings.robots}
         self._status.idle = "inactive"
         self._files = FileServices(node, settings, self._trajectories, self._graph)
-        self._files.open(_SERVICES, built)
-        for kind, name, callback in (
+        self._files.open(
+            built,
             (Reset, "~/reset", self._on_reset),
             (SetBool, "~/pause", self._on_pause),
             (RemoveLoop, "~/remove_loop", self._on_remove_loop),
-        ):
-            service = node.create_service(kind, name, callback, qos_profile=_SERVICES)
-            built.callback(node.destroy_service, service)
+        )
 
     def listen(self, listening: ExitStack) -> None:
         """Take relative poses until ``listening`` is closed."""
-        settings = self.settings
         with checked_overrides():
             for robot in self._robots.values():
-                entry = Input(
-                    self.node,
-                    self._status,
-                    RelativePose,
-                    of_robot(robot.name, settings.relative_pose_topic),
-                    settings.relative_pose_depth,
-                    partial(self._on_relative_pose, robot),
-                    lambda message: messages.to_ns(message.origin_stamp),
-                    settings.source_timeout_s,
-                    at_once=_AT_ONCE,
-                )
+                own, take = robot.own_settings(self.settings), partial(self._on_relative_pose, robot)
+                entry = relative_poses(self.node, self._status, own, take)
                 listening.callback(entry.close)
                 self._inputs.append(entry)
         listening.callback(self._inputs.clear)
@@ -125,8 +108,8 @@ class RobotFleet:
         listening.callback(self.node.destroy_timer, self._pending)
         self._status.idle = ""
         listening.callback(setattr, self._status, "idle", "inactive")
-        names = ", ".join(settings.robots)
-        self.node.get_logger().info(f"ready: {self.node.get_fully_qualified_name()}, {settings.world}, robots {names}")
+        name, settings = self.node.get_fully_qualified_name(), self.settings
+        self.node.get_logger().info(f"ready: {name}, {settings.world}, robots {', '.join(settings.robots)}")
 
     def change(self, settings: NgoNodeSettings) -> None:
         """Take settings that may change while the node runs."""

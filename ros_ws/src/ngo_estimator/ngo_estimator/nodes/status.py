@@ -14,6 +14,7 @@ from rclpy.node import Node
 from ngo_common.nodes.name_watch import NameWatch
 from ngo_common.nodes.qos import overridable
 from ngo_estimator.nodes.messages import to_time
+from ngo_estimator.nodes.settings import StepSettings
 
 _QUIET_S = 5.0
 """Least time between two warnings of one kind."""
@@ -28,12 +29,11 @@ class NodeStatus:
     def __init__(
         self,
         node: Node,
-        topic: str,
-        period_s: float,
+        settings: StepSettings,
         details: Callable[[], dict[str, str]],
         problems: Callable[[], list[str]] = list,
     ) -> None:
-        """Publish on ``topic`` every ``period_s``; ``details`` adds the node's own values, ``problems`` lines."""
+        """Publish as the settings say; ``details`` adds the node's own values, ``problems`` lines."""
         self._node = node
         self._details, self._problems = details, problems
         self._name_watch = NameWatch(node)
@@ -45,8 +45,11 @@ class NodeStatus:
         self.idle = ""
         """Why no input is expected now; empty: input is expected."""
         self._start_period()
-        self._publisher = node.create_publisher(DiagnosticArray, topic, 10, qos_overriding_options=overridable())
-        self._timer = node.create_timer(period_s, self._publish, clock=Clock(clock_type=ClockType.STEADY_TIME))
+        self._publisher = node.create_publisher(
+            DiagnosticArray, settings.diagnostics_topic, 10, qos_overriding_options=overridable()
+        )
+        clock = Clock(clock_type=ClockType.STEADY_TIME)
+        self._timer = node.create_timer(settings.diagnostics_period_s, self._publish, clock=clock)
 
     def close(self) -> None:
         """Publish no more."""
