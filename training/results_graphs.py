@@ -25,7 +25,7 @@ from training.baselines import graph_peers
 from training.common import records
 from training.common.command_line import check_among, run_command
 from training.common.records import write_at_once
-from training.report import graphs_page
+from training.report import graphs_figure, graphs_page
 from training.scoring.graph_problems import KINDS, JudgedProblem, Online, blocks, lecture_hall, manhattan, synthetic
 from training.scoring.table import intervals
 
@@ -41,6 +41,9 @@ PEERS: dict[str, graph_peers.Peer] = {
     "gtsam_lm_geman_mcclure": graph_peers.geman_mcclure,
     "pcm": graph_peers.pcm,
 }
+_DRAWN = ("own", "lookalike_50")
+"""Cells of online graphs whose first seed is drawn."""
+
 _OURS: dict[str, Callable[[], Corrector]] = {"robust": Robust, "robust_anew": Robust}
 ROWS = ("odometry", *PEERS, *_OURS, "right_loops")
 SOLVED = 1.5
@@ -89,8 +92,18 @@ def main(arguments: Arguments) -> dict[str, Any]:
         print("lecture_hall and manhattan are skipped: --folder gives none")
     _measure(synthetic("random", 30, 200, True, 0), arguments.rows, arguments.limit_s)  # compiles everything
     for graph, cell, draw in _cells(arguments):
-        measure = _measure_online if graph.endswith(_ONLINE) else _measure
-        measured = [measure(draw(seed), arguments.rows, arguments.limit_s) for seed in arguments.seeds]
+        measured = []
+        for seed in arguments.seeds:
+            judged = draw(seed)
+            if not graph.endswith(_ONLINE):
+                measured.append(_measure(judged, arguments.rows, arguments.limit_s))
+                continue
+            numbers, online = _measure_online(judged, arguments.rows, arguments.limit_s)
+            measured.append(numbers)
+            if online.solutions and seed == arguments.seeds[0] and cell.startswith(_DRAWN):
+                name = f"results_graphs_{graph}.png"
+                graphs_figure.draw(arguments.docs / "images" / name, list(blocks(judged)), online)
+                result.setdefault("pictures", {})[graph] = [name, cell]
         rows = result["tables"].setdefault(graph, {}).setdefault(cell, {})
         for row in measured[0]:
             made = {"graphs": len(measured), "revision": result["revision"]}
@@ -153,16 +166,18 @@ def _measure(
     return numbers
 
 
-def _measure_online(judged: JudgedProblem, rows: tuple[str, ...], limit_s: int) -> dict[str, dict[str, float]]:
-    """The means over all blocks, and the share of verdicts that changed."""
+def _measure_online(
+    judged: JudgedProblem, rows: tuple[str, ...], limit_s: int
+) -> tuple[dict[str, dict[str, float]], Online]:
+    """The means over all blocks, the share of verdicts that changed, and the solutions."""
     online = Online(Robust())
     found = [_measure(block, rows, limit_s, online.correct) for block in blocks(judged)]
     means = {
         row: {key: float(np.mean([block[row][key] for block in found])) for key in found[0][row]} for row in found[0]
     }
     if "robust" in means:
-        means["robust"]["changed"] = online.changed / max(online.verdicts, 1)
-    return means
+        means["robust"]["changed"] = online.changed
+    return means, online
 
 
 def _numbers(judged: JudgedProblem, poses: np.ndarray, seconds: float, bar: float) -> dict[str, float]:

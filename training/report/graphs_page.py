@@ -4,6 +4,7 @@ from typing import Any
 
 import numpy as np
 
+from training.report.graphs_figure import CAPTION
 from training.report.page import markdown
 
 _HEAD = """# Pose graphs with wrong loops
@@ -55,6 +56,9 @@ def page(result: dict[str, Any]) -> str:
             + "\n"
         )
         parts.append(_over_cells(cells, rows) + "\n")
+        if graph in result.get("pictures", {}):
+            name, cell = result["pictures"][graph]
+            parts.append(f"`{cell}`: {CAPTION}\n\n![Verdicts about the loops of {graph} as they come](images/{name})\n")
     return "\n".join(parts).rstrip() + "\n"
 
 

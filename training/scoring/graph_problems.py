@@ -220,15 +220,17 @@ class Online:
 
     def __init__(self, corrector: Corrector) -> None:
         self._corrector = corrector
-        self._last: CorrectedGraph | None = None
-        self.changed = self.verdicts = 0
-        """Verdicts about known loops that changed, and all of them."""
+        self.solutions: list[CorrectedGraph] = []
+        """One of each block."""
 
     def correct(self, problem: GraphProblem) -> CorrectedGraph:
         """The solution of the next block."""
-        before, self._last = self._last, self._corrector.correct(problem, self._last)
-        if before is not None:
-            known = len(before.loop_weights)
-            self.changed += int((before.loop_weights != self._last.loop_weights[:known]).sum())
-            self.verdicts += known
-        return self._last
+        self.solutions.append(self._corrector.correct(problem, *self.solutions[-1:]))
+        return self.solutions[-1]
+
+    @property
+    def changed(self) -> float:
+        """Share of the verdicts about known loops that changed."""
+        verdicts = [solution.loop_weights for solution in self.solutions]
+        changes = [after[: len(before)] != before for before, after in zip(verdicts[:-1], verdicts[1:], strict=True)]
+        return float(np.concatenate(changes).mean()) if changes else 0.0

@@ -8,13 +8,13 @@ import numpy as np
 import pytest
 
 from ngo_estimator.geometry.se2 import between, compose
-from ngo_estimator.graph.corrector import GraphProblem
+from ngo_estimator.graph.corrector import CorrectedGraph, GraphProblem
 from ngo_estimator.graph.cycle_agreement import ChainUncertainty, chain_poses
 from ngo_estimator.graph.loop_evidence import map_area, scale_and_inlier_ratio
 from ngo_estimator.graph.robust import Robust
 from training import results_graphs
 from training.baselines import graph_peers
-from training.scoring.graph_problems import KINDS, JudgedProblem, blocks, synthetic
+from training.scoring.graph_problems import KINDS, JudgedProblem, Online, blocks, synthetic
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -89,14 +89,19 @@ def test_our_corrector_finds_what_gtsam_finds_in_a_clean_graph(easy: JudgedProbl
 
 @pytest.mark.parametrize(
     ("kind", "percent", "nodes", "metric", "seed"),
-    [("lookalike", 70, 1000, True, 0), ("random", 80, 1000, False, 105), ("lookalike", 67, 3333, False, 107)],
+    [
+        ("lookalike", 70, 1000, True, 0),
+        ("lookalike", 50, 3000, True, 102),
+        ("random", 80, 1000, False, 105),
+        ("lookalike", 67, 3333, False, 107),
+    ],
 )
 def test_a_hard_graph_is_solved_though_its_chain_rules_out_loops_that_are_right(
     kind: str, percent: int, nodes: int, metric: bool, seed: int
 ) -> None:
     """Most loops are wrong, and the odometry is 9 m off; of places, only the ways between them say which.
 
-    The largest graph has more loops than one factor holds.
+    In the second graph a stretch lies wrongly at first. The largest one has more loops than one factor holds.
     """
     judged = synthetic(kind, percent, nodes, metric, seed, hard=True)
     problem, kept = judged.problem, judged.problem.loops[judged.right]
@@ -179,3 +184,26 @@ def test_online_a_graph_comes_in_blocks_and_is_solved_in_each(tmp_path: Path, mo
     assert cell["robust"]["changed"]["mean"] < 0.02
     page = (tmp_path / "results_graphs.md").read_text()
     assert "| mean over cells | cells | solved | seconds | precision | recall | cheapest | changed |" in page
+
+
+def test_verdicts_that_changed_are_counted_and_drawn(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A corrector that believes every second loop, and in the next block the others."""
+
+    class Fickle:
+        def correct(self, problem: GraphProblem, start: CorrectedGraph | None = None) -> CorrectedGraph:
+            verdicts = (np.arange(len(problem.loops)) % 2 == (start is None)).astype(np.float64)
+            return CorrectedGraph(problem, problem.poses, verdicts, np.ones(len(problem.steps)), 0.0)
+
+    judged = synthetic("lookalike", 50.0, 250, True, 1)
+    parts, online = list(blocks(judged))[:2], Online(Fickle())
+    for part in parts:
+        online.correct(part.problem)
+    assert online.changed == 1.0 and len(online.solutions) == len(parts) == 2
+    monkeypatch.setattr(results_graphs, "synthetic", lambda *_, hard=False: judged)
+    arguments = results_graphs.Arguments(
+        graphs=("synthetic_1000_online",), kinds=("lookalike",), percents=(50,), seeds=(0,), rows=("robust",),
+        out=tmp_path, docs=tmp_path,
+    )  # fmt: skip
+    results_graphs.main(arguments)
+    assert (tmp_path / "images/results_graphs_synthetic_1000_online.png").stat().st_size > 10_000
+    assert "](images/results_graphs_synthetic_1000_online.png)" in (tmp_path / "results_graphs.md").read_text()

@@ -5,6 +5,7 @@ another by chance only where the stretches of chain between them are long (pairw
 """
 
 import math
+from copy import copy
 
 import numpy as np
 from numba import njit
@@ -14,6 +15,9 @@ from ngo_estimator.graph.relative_poses import RelativePoses
 
 _NOTHING_KNOWN = 1e12
 """Variance of a direction of which a loop says nothing."""
+
+_HELD = 0.1
+"""Variances of a chain that loops hold, as a share of those without them."""
 
 
 class ChainUncertainty:
@@ -36,6 +40,12 @@ class ChainUncertainty:
         sums = np.cumsum(moved @ covariances(steps) @ moved.mT, axis=0)
         self.sums = np.concatenate((np.zeros((1, 3, 3)), sums))
         """Covariances ``(nodes, 3, 3)`` of what all steps before a node move the map by, about its origin."""
+
+    def bent(self, poses: np.ndarray) -> "ChainUncertainty":
+        """The chain where a solution puts the nodes ``(nodes, 3)``: loops hold it, so that it is known better."""
+        bent = copy(self)
+        bent.poses, bent.sums = poses, _HELD * self.sums
+        return bent
 
     def off_chain(self, loops: RelativePoses) -> tuple[np.ndarray, np.ndarray]:
         """Squared residual of each loop against the chain ``(n,)``, and the log of its covariance's determinant.

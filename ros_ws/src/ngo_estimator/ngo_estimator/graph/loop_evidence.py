@@ -21,6 +21,18 @@ _PARTNERS = 16
 _MOST_SUPPORT = 7.0
 """What agreeing partners can say for a loop, log odds: in a group that is wrong together all agree."""
 
+_APART = 60
+"""Nodes: loops as near as this at both ends may be wrong together, as between two stretches that look alike."""
+
+_ASKED = 64
+"""Nearest loops among which those farther apart than that are looked for."""
+
+_AGREE = 0.2
+"""Share of the partners of a right loop that are right, where a solution refuses them."""
+
+_MOST_SAID = 5.0
+"""Log odds of one of these partners: some agree by chance."""
+
 _SCALES = np.exp(np.linspace(math.log(1e-3), math.log(1e3), 61))
 _SMALL, _OFTEN = 0.115, 0.05
 """One right loop in a hundred is off by less than the first (squared, in variances of three degrees of freedom). Where
@@ -88,24 +100,44 @@ def cycle_odds(chain: ChainUncertainty, loops: RelativePoses, area: float, inlie
     whole = loops.degrees == 3
     for rows in (np.flatnonzero(whole), np.flatnonzero(~whole)):
         if len(rows) > 1:
-            odds[rows] += np.minimum(_support(chain, loops[rows], area, inlier_ratio), _MOST_SUPPORT)
+            pairs = _nearest(loops.nodes[rows], _PARTNERS + 1)
+            pairs = pairs[pairs[:, 0] != pairs[:, 1]]
+            odds[rows] += np.minimum(_support(chain, loops[rows], pairs, area, inlier_ratio), _MOST_SUPPORT)
     return odds
 
 
-def _support(chain: ChainUncertainty, loops: RelativePoses, area: float, inlier_ratio: float) -> np.ndarray:
+def agreement(chain: ChainUncertainty, loops: RelativePoses, area: float) -> np.ndarray:
+    """What loops ``(n,)`` that know their whole relative pose say of each other, log odds, but for those near each."""
+    pairs = _nearest(loops.nodes, _ASKED)
+    pairs = pairs[(np.abs(loops.nodes[pairs[:, 0]] - loops.nodes[pairs[:, 1]]) > _APART).any(1)]
+    return _support(chain, loops, pairs, area, _AGREE, _MOST_SAID)
+
+
+def _nearest(nodes: np.ndarray, count: int) -> np.ndarray:
+    """Pairs ``(n, 2)`` of each loop and the nearest ones by their ends ``(loops, 2)``, itself among them."""
+    ends, count = nodes.astype(np.float64), min(count, len(nodes))
+    partner = KDTree(ends).query(ends, k=count, p=1)[1]
+    return np.stack((np.repeat(np.arange(len(nodes)), count), partner.ravel()), axis=1)
+
+
+def _support(
+    chain: ChainUncertainty,
+    loops: RelativePoses,
+    pairs: np.ndarray,
+    area: float,
+    inlier_ratio: float,
+    most: float = _LARGEST,
+) -> np.ndarray:
     """What their partners say of loops ``(n,)``, log odds: each of these is right as often as the inlier ratio says.
 
-    All loops know the heading, or none of them is asked for it.
+    All loops know the heading, or none of them is asked for it; ``pairs`` ``(k, 2)`` are a loop and its partner, which
+    says at most so much.
     """
-    ends, count = loops.nodes.astype(np.float64), min(_PARTNERS + 1, len(loops))
-    partner = KDTree(ends).query(ends, k=count, p=1)[1]
-    pairs = np.stack((np.repeat(np.arange(len(loops)), count), partner.ravel()), axis=1)
-    pairs = pairs[pairs[:, 0] != pairs[:, 1]]
     if (loops.degrees == 3).all():
         ratio = likelihood_ratio(*chain.off_pairs(loops, pairs), np.full(len(pairs), 3), area)
     else:
         ratio = place_ratio(chain, loops, pairs)
-    each = np.log(inlier_ratio * np.exp(np.minimum(ratio, _LARGEST)) + 1.0 - inlier_ratio)
+    each = np.log(inlier_ratio * np.exp(np.minimum(ratio, most)) + 1.0 - inlier_ratio)
     return np.bincount(pairs[:, 0], each, len(loops))
 
 

@@ -23,7 +23,7 @@ from ngo_estimator.graph.corrector import (
 )
 from ngo_estimator.graph.cycle_agreement import ChainUncertainty, chain_poses
 from ngo_estimator.graph.graduated import graduate
-from ngo_estimator.graph.loop_evidence import cycle_odds, likeliest_mixture, map_area, scale_and_inlier_ratio
+from ngo_estimator.graph.loop_evidence import agreement, cycle_odds, likeliest_mixture, map_area, scale_and_inlier_ratio
 from ngo_estimator.graph.normal_equations import GraphStructure
 from ngo_estimator.graph.relative_poses import RelativePoses
 from ngo_estimator.graph.surest_first import believe
@@ -53,6 +53,18 @@ _FEWER = 0.7
 _AGREE = 0.9
 """So many of the places that cycles let in or a solution believes are both. Otherwise the chain may be worse than
 stated: then all loops are tried, too."""
+
+_MOST_ROUNDS = 3
+"""So often refused loops that agree with each other are asked again."""
+
+_AGREED = 2.0
+"""Log odds at which they are."""
+
+_MANY = 0.02
+"""A solution is looked for anew for so many of them, as a share of the loops that are believed."""
+
+_LESS = 0.999
+"""Share of the cost below which a solution is worth another round."""
 
 _LEAST_REDUNDANCY = 30.0
 """Degrees of freedom from which on residuals measure a scale."""
@@ -135,6 +147,7 @@ def _from_nothing(problem: GraphProblem, report: Progress, least_scale: float) -
         poses = graduate(everything, chain, report=report, structure=structure)[0]
         best = min(best, poses, key=lambda poses: truncated_cost(scaled, poses))
     solution = _polished(problem, best, scale, len(problem.loops), least_scale)
+    solution = _reconsidered(problem, solution, report, least_scale)
     # Cycles with the chain have its errors in common and measure a scale roughly; residuals of the solution do it well.
     if scale not in (1.0, solution.loop_scale):
         solution = _polished(problem, solution.poses, solution.loop_scale, len(problem.loops), least_scale)
@@ -165,6 +178,32 @@ def _second_look(
     misfit = problem.loops.squared(poses) / thresholds(problem.loops)
     nearest, structure = _affordable(replace(problem, poses=poses), np.argsort(misfit, kind="stable"))
     return believe(nearest, poses, nearest.fits(poses), area, inlier_ratio, report, structure)[0]
+
+
+def _reconsidered(
+    problem: GraphProblem, solution: CorrectedGraph, report: Progress, least_scale: float
+) -> CorrectedGraph:
+    """The solution after its refused loops that agree with each other were asked again, while that lowers the cost.
+
+    Where a stretch of the graph lies wrongly, the right loops that lead there are refused, and say the same of it.
+    """
+    scaled = problem.scaled(solution.scale)
+    chain, loops = ChainUncertainty(scaled.steps), scaled.loops
+    for _ in range(_MOST_ROUNDS):
+        poses, believed = solution.poses, solution.loop_weights > 0.0
+        again = np.flatnonzero(~believed & (loops.degrees == 3))
+        if len(again) > _MANY * believed.sum():
+            again = again[agreement(chain.bent(poses), loops[again], map_area(poses)) > _AGREED]
+        if len(again) <= _MANY * believed.sum():
+            break
+        asked, structure = _affordable(replace(scaled, poses=poses), np.append(np.flatnonzero(believed), again))
+        poses = graduate(asked, poses, report=report, structure=structure)[0]
+        other = _polished(problem, poses, solution.scale, solution.loops_from_nothing, least_scale)
+        little = other.cost > _LESS * solution.cost
+        solution = min(solution, other, key=lambda each: each.cost)
+        if little:
+            break
+    return solution
 
 
 def _warm(problem: GraphProblem, start: CorrectedGraph, report: Progress, least_scale: float) -> CorrectedGraph:
