@@ -226,9 +226,10 @@ def test_vertices_without_a_line_begin_where_the_steps_put_them(tmp_path: Path) 
     edges = [line for line in lines if line.startswith("EDGE")]
     graph = _chained(tmp_path, edges)
     np.testing.assert_allclose(between(graph.problem.poses, poses), 0.0, atol=1e-9)
-    del edges[3]
-    with pytest.raises(ValueError, match="vertex 4 has no line, and no step leads to it from 3"):
-        _chained(tmp_path, edges)
+    del edges[3]  # the second part begins where the first one ends: loops alone say where it lies
+    broken = _chained(tmp_path, edges)
+    assert broken.breaks == 1 and broken.problem.poses[4].tolist() == broken.problem.poses[3].tolist()
+    np.testing.assert_allclose(between(broken.problem.poses[4], broken.problem.poses[15]), between(poses[4], poses[15]))
 
 
 def test_parts_that_nothing_joins_are_both_solved(tmp_path: Path) -> None:
@@ -248,6 +249,18 @@ def test_an_edge_that_is_marked_is_a_loop_and_one_without_heading_too(tmp_path: 
     graph = _chained(tmp_path, lines)
     assert graph.breaks == 2 and len(graph.problem.loops) == 3
     assert graph.problem.loops.degrees.tolist() == [3, 2, 3]
+
+
+def test_of_two_edges_between_neighbours_the_step_is_the_one_that_the_vertices_were_made_from(tmp_path: Path) -> None:
+    """The other one is a loop, in whatever order they are; a step that is written again is none."""
+    lines, _ = _ring(list(range(16)))
+    wrong = f"EDGE_SE2 3 4 5 2 1 {INFORMATION}"
+    for mixed in ([wrong, *lines], [*lines, wrong]):
+        graph = _chained(tmp_path, mixed)
+        assert graph.problem.steps.relative[3, 0] == 1.0
+        assert graph.problem.loops.relative[:, 0].max() == 5.0 and len(graph.problem.loops) == 2
+    twice = _chained(tmp_path, [*lines, *lines[16:-1]])
+    assert len(twice.problem.loops) == 1 and len(_solved(twice).edges) == 2 * 15 + 1
 
 
 def test_the_fixed_vertex_stays_and_there_is_one(tmp_path: Path) -> None:

@@ -21,8 +21,9 @@ _BREAK = -1  # in place of an edge, where no step leads to the next vertex
 class ChainedGraph:
     """A graph, sorted.
 
-    An edge between neighbours that is not marked as a loop and knows the whole relative pose is a step. Where there is
-    none, a step that knows next to nothing stands in: it is as wide as the graph. All other edges are loops.
+    An edge between neighbours that is not marked as a loop and knows the whole relative pose is a step: of several, the
+    one that fits the vertices' lines best. Where there is none, a step that knows next to nothing stands in: it is as
+    wide as the graph. A step that is written again is left out; all other edges are loops.
 
     Attributes:
         graph: with its vertices by their ids, and those that had no line.
@@ -69,7 +70,7 @@ def chained(graph: PlanarGraph) -> ChainedGraph:
     """Sort a graph.
 
     Raises:
-        ValueError: several vertices are fixed, or a vertex has no line and no step leads to it.
+        ValueError: several vertices are fixed.
     """
     if len(graph.fixed) > 1:
         raise ValueError(f"FIX holds {len(graph.fixed)} vertices, {graph.fixed[0]} first; expected one at most")
@@ -77,25 +78,29 @@ def chained(graph: PlanarGraph) -> ChainedGraph:
     nodes, known = np.searchsorted(ids, graph.edges), np.searchsorted(ids, graph.ids)
     apart = nodes[:, 1] - nodes[:, 0]
     may_step = np.flatnonzero((np.abs(apart) == 1) & ~graph.is_loop & np.einsum("kii->ki", graph.information).all(1))
+    poses, stamps = np.full((len(ids), 3), np.nan), np.full(len(ids), UNSTAMPED)
+    poses[known], stamps[known] = graph.poses, graph.stamps_ns
+    edges = RelativePoses(nodes, graph.relative, _roots(graph.information))
+    may_step = may_step[np.argsort(edges[may_step].squared(poses), kind="stable")]
     begins, first = np.unique(nodes[may_step].min(1), return_index=True)
     steps = np.full(len(ids) - 1, _BREAK)
     steps[begins] = may_step[first]
-    loops = np.setdiff1d(np.arange(len(nodes)), steps)
+    twins, written = steps[nodes[may_step].min(1)], (nodes, graph.relative, graph.information.reshape(-1, 9))
+    again = may_step[np.all([(each[may_step] == each[twins]).all(1) for each in written], axis=0)]
+    loops = np.setdiff1d(np.arange(len(nodes)), again)
     relative, root = _forward(graph, steps, apart)
-    poses, stamps = np.full((len(ids), 3), np.nan), np.full(len(ids), UNSTAMPED)
-    poses[known], stamps[known] = graph.poses, graph.stamps_ns
-    _fill(poses, relative, steps, ids)
     gaps = np.flatnonzero(steps == _BREAK)
+    relative[gaps] = 0.0
+    _fill(poses, relative)
     relative[gaps] = between(poses[gaps], poses[gaps + 1])
     span = max(float(np.ptp(poses[:, :2], axis=0).max()), 1.0)
     root[gaps] = np.diag((1.0 / span, 1.0 / span, 1.0 / math.pi))
     chain = RelativePoses(np.stack((np.arange(len(steps)), np.arange(1, len(ids))), axis=1), relative, root)
-    measured = RelativePoses(nodes[loops], graph.relative[loops], _roots(graph.information[loops]))
     whole = PlanarGraph(
         ids, poses, stamps, graph.edges, graph.relative, graph.information, graph.is_loop, graph.belief, graph.fixed,
         graph.remarks,
     )  # fmt: skip
-    return ChainedGraph(whole, GraphProblem(poses, chain, measured, np.ones(len(loops))), (steps, loops))
+    return ChainedGraph(whole, GraphProblem(poses, chain, edges[loops], np.ones(len(loops))), (steps, loops))
 
 
 def _forward(graph: PlanarGraph, steps: np.ndarray, apart: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -114,16 +119,11 @@ def _forward(graph: PlanarGraph, steps: np.ndarray, apart: np.ndarray) -> tuple[
     return relative, root
 
 
-def _fill(poses: np.ndarray, relative: np.ndarray, steps: np.ndarray, ids: np.ndarray) -> None:
-    """Poses of the vertices that had no line, by the steps from the last one that had."""
+def _fill(poses: np.ndarray, relative: np.ndarray) -> None:
+    """Poses of the vertices that had no line, by the steps ``(n, 3)`` from the last one that had."""
     if np.isnan(poses[0, 0]):
         poses[0] = 0.0
     missing = np.flatnonzero(np.isnan(poses[:, 0]))
-    if (lost := missing[steps[missing - 1] == _BREAK]).size:
-        raise ValueError(
-            f"the vertex {ids[lost[0]]} has no line, and no step leads to it from {ids[lost[0] - 1]}; "
-            "expected a VERTEX_SE2 of it"
-        )
     known, chain = np.setdiff1d(np.arange(len(poses)), missing), chain_poses(relative)
     before = known[np.searchsorted(known, missing) - 1]
     poses[missing] = compose(poses[before], between(chain[before], chain[missing]))
