@@ -88,7 +88,7 @@ def main(arguments: Arguments) -> dict[str, Any]:
         "odometry": asdict(CameraConfig()),
         "graph": asdict(PictureGraphConfig()),
         "drives": drives,
-        "median": _medians(list(drives.values())),
+        "median": _medians(drives),
         "tables": {arguments.places: _rows(list(drives.values()))},
     }
     records.write_at_once(path, json.dumps(result, indent=1, default=str) + "\n")
@@ -131,11 +131,23 @@ def _rows(drives: list[dict[str, Any]]) -> dict[str, Numbers]:
     return rows
 
 
-def _medians(drives: list[dict[str, Any]]) -> dict[str, float]:
-    names = [name for name in drives[0] if name != "revision"]
-    medians = {name: float(np.median([one[name] for one in drives])) for name in names}
-    shares = [one["corrected_ate_m"] / one["given_ate_m"] for one in drives]
-    return {**medians, "corrected_share": float(np.median(shares)), "worst_share": float(np.max(shares))}
+def _medians(drives: _Drives) -> dict[str, float]:
+    """Medians of all numbers, and of the share of the given error that is left: the worst of a drive, and of a place,
+    whose errors are means over its drives."""
+    numbers, places = list(drives.values()), {name.rpartition(" ")[0] for name in drives}
+    names = [name for name in numbers[0] if name != "revision"]
+
+    def share(of: list[dict[str, Any]]) -> float:
+        return sum(one["corrected_ate_m"] for one in of) / sum(one["given_ate_m"] for one in of)
+
+    shares = [share([one]) for one in numbers]
+    of_places = [share([one for name, one in drives.items() if name.rpartition(" ")[0] == place]) for place in places]
+    return {
+        **{name: float(np.median([one[name] for one in numbers])) for name in names},
+        "corrected_share": float(np.median(shares)),
+        "worst_share": max(shares),
+        "worst_place_share": max(of_places),
+    }
 
 
 if __name__ == "__main__":

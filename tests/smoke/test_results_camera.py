@@ -66,6 +66,8 @@ def test_a_short_drive_on_a_map(tmp_path: Path, monkeypatch: pytest.MonkeyPatch)
         0.5 * (drive["corrected_ate_m"] + other["corrected_ate_m"])
     )
     assert json.loads((tmp_path / "camera.json").read_text())["median"] == result["median"]
+    left, given = ([each[of] for each in (drive, other)] for of in ("corrected_ate_m", "given_ate_m"))
+    assert result["median"]["worst_place_share"] == pytest.approx(sum(left) / sum(given))
 
 
 def test_rooms_of_another_renderer_ask_for_it_in_one_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
