@@ -82,8 +82,7 @@ def run(arguments: Arguments, console: Console) -> list[Path]:
 
 def main() -> None:
     """Run with the command line's arguments."""
-    console = Console(soft_wrap=True, highlight=False)
-    run_command(NAME, lambda: run(tyro.cli(Arguments, prog=NAME, description=__doc__), console))
+    run_command(NAME, Arguments, __doc__, run)
 
 
 if __name__ == "__main__":

@@ -73,7 +73,7 @@ def run(arguments: Arguments, console: Console) -> dict[str, Any]:
     except ValueError as error:
         raise ValueError(f"{arguments.graph}: {error}") from None
     for line in _findings(read, graph):
-        console.print(line, soft_wrap=True, highlight=False)
+        console.print(line)
     began = time.monotonic()
     screen = Console(stderr=True)
     with screen.status("") as status:
@@ -86,7 +86,7 @@ def run(arguments: Arguments, console: Console) -> dict[str, Any]:
     corrected = graph.corrected(solution)
     report = _report(arguments, graph, solution, time.monotonic() - began)
     for line in _summary(report):
-        console.print(line, soft_wrap=True, highlight=False)
+        console.print(line)
     write_g2o(arguments.out, corrected)
     write_together({arguments.out.with_suffix(".json"): json.dumps(report, indent=1) + "\n"})
     if arguments.picture:
@@ -154,7 +154,7 @@ def _summary(report: dict[str, Any]) -> list[str]:
 
 def main() -> None:
     """Run with the command line's arguments."""
-    run_command(NAME, lambda: run(tyro.cli(Arguments, prog=NAME, description=__doc__), Console()))
+    run_command(NAME, Arguments, __doc__, run)
 
 
 if __name__ == "__main__":

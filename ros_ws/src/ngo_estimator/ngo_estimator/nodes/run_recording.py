@@ -19,7 +19,7 @@ from collections import Counter
 from collections.abc import Iterator
 from contextlib import ExitStack
 from dataclasses import dataclass, field, fields, replace
-from functools import cache, partial
+from functools import cache
 from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -178,8 +178,8 @@ def _run(arguments: Arguments, out: Path, console: Console) -> dict[str, Any]:
         why = "; ".join(f"{count} {reason}, first {core.examples.get(reason, '')}" for reason, count in _rejected(core))
         raise ValueError(f"no two frames of {topics.image} could be used: {why or f'it has {core.frames}'}")
     for line in _losses(core, max(core.frames, recording.topics[topics.image].count)):
-        console.print(line, soft_wrap=True, highlight=False)
-    console.print(f"{core.frames} frames in {took_s:.1f} s, {core.frames / took_s:.0f} frames/s", highlight=False)
+        console.print(line)
+    console.print(f"{core.frames} frames in {took_s:.1f} s, {core.frames / took_s:.0f} frames/s")
     return {
         "recordings": [str(path) for path in arguments.recordings],
         "weights": world,
@@ -229,27 +229,23 @@ def _write(
                 if not bar.disable:
                     progress.update(task, completed=core.frames)
                 continue
-            found.append(
-                {
-                    "folder": output.folder.relative_to(out).as_posix(),
-                    "poses": len(event.trajectory.stamps_ns),
-                }
-            )
+            name, poses = output.folder.relative_to(out).as_posix(), len(event.trajectory.stamps_ns)
+            found.append({"folder": name, "poses": poses})
             title = f"{arguments.recordings[0].name}{'' if len(found) == 1 else f', part {len(found)}'}"
             try:
                 reports = output.finish(event, title, settings)
             except ValueError as error:
-                console.print(f"no errors were measured: {error}", soft_wrap=True, highlight=False)
+                console.print(f"no errors were measured: {error}")
                 reports = {}
             if output.coarser:
-                console.print(output.coarser, soft_wrap=True, highlight=False)
+                console.print(output.coarser)
             if output.left_out:
-                console.print(f"scans are not in the map: {output.left_out}", soft_wrap=True, highlight=False)
+                console.print(f"scans are not in the map: {output.left_out}")
             stack.pop_all().close()
             if reports:
-                console.print(report_table(title, reports, ("first", "best")))
+                console.print(report_table(title, reports, ("first", "best")), soft_wrap=False)
                 for line in remarks(reports):
-                    console.print(line, soft_wrap=True, highlight=False)
+                    console.print(line)
             output = None
     return found
 
@@ -272,8 +268,8 @@ def _networks(arguments: Arguments, folder: Path, recording: Recording, console:
     online = OnlineTrajectory.load(folder, arguments.window_frames, arguments.world, *bounds)
     topics = choose_topics(recording, _for_weights(recording, arguments.topics, local))
     _check_side_information(topics, local)
-    console.print("; ".join((f"using {_words(topics)}", *recording.notes)), soft_wrap=True, highlight=False)
-    with compiling(partial(console.print, highlight=False)):
+    console.print("; ".join((f"using {_words(topics)}", *recording.notes)))
+    with compiling(console.print):
         warm_up_networks(online)
     core = RecordingRun(local, online, scan_yaw_rad=math.radians(arguments.scan_yaw_deg))
     frames = frames_of(recording, topics, core.rejected, local.image_format.largest_picture)
@@ -303,21 +299,21 @@ def _lidar(arguments: Arguments, folder: Path, recording: Recording, console: Co
     if arguments.scan_yaw_deg != 0.0:
         described = described.looking_at(math.radians(arguments.scan_yaw_deg))
     for line in described.lines():
-        console.print(line, soft_wrap=True, highlight=False)
+        console.print(line)
     first_frame = described.scan_frame
 
     @cache
     def mounting_of(frame: str) -> Mounting | None:
         found = described.mounting if frame == first_frame else find_mounting(recording, topics, frame)
         if frame != first_frame and found is not None:
-            console.print(f"another scanner: {found}", soft_wrap=True, highlight=False)
+            console.print(f"another scanner: {found}")
         return None if found is None else Mounting(found.base_from_scan_xyyaw, found.upside_down, found.height_m)
 
     truth = Truth()
     if topics.ground_truth is not None:
         for frame in frames_of(recording, topics):
             truth.add(frame)
-    with compiling(partial(console.print, highlight=False)):
+    with compiling(console.print):
         warm_up_scans()
     core = LidarRun(odometry, online, mounting_of, arguments.min_range)
     known = core.learn(scan_stream(recording, topics, skipped=Counter()))
@@ -364,10 +360,8 @@ def _camera(arguments: Arguments, recording: Recording, console: Console) -> "St
     model = calibrated_camera(seen, pose)
     odometry = PictureOdometry(model)
     used = f"using {_words(topics)}, calibration {info}"
-    console.print("; ".join((used, *recording.notes)), soft_wrap=True, highlight=False)
-    console.print(
-        f"camera: {seen.width} x {seen.height}, {model.description}; {where}", soft_wrap=True, highlight=False
-    )
+    console.print("; ".join((used, *recording.notes)))
+    console.print(f"camera: {seen.width} x {seen.height}, {model.description}; {where}")
     core = CameraRun(odometry, PictureTrajectory(iterations_per_step=arguments.iterations_per_step))
     wheels = wheel_poses(recording, topics, core.rejected)
     frames = frames_of(recording, topics, core.rejected, (seen.height, seen.width))
@@ -432,7 +426,7 @@ def _losses(core: "Run", images: int) -> list[str]:
 def main() -> None:
     """Run with the command line's arguments."""
     gc.set_threshold(_OBJECTS_BETWEEN_COLLECTIONS)
-    run_command(NAME, lambda: run(tyro.cli(Arguments, prog=NAME, description=__doc__), Console()))
+    run_command(NAME, Arguments, __doc__, run)
 
 
 if __name__ == "__main__":
