@@ -6,15 +6,14 @@ import os
 import signal
 import subprocess
 import sys
-import threading
-import time
-from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 from mcap.reader import make_reader
 
 from ngo_estimator.checkpoint import write_untrained
+
+from .processes import wait_until
 
 pytestmark = pytest.mark.processes
 
@@ -78,21 +77,14 @@ def running(pid: int) -> bool:
         return False
 
 
-def wait_until(condition: Callable[[], bool], what: str, timeout_s: float = 60.0) -> None:
-    end = time.monotonic() + timeout_s
-    while not condition():
-        assert time.monotonic() < end, f"waited {timeout_s} s in vain until {what}"
-        threading.Event().wait(0.05)
-
-
 def test_interrupted_it_leaves_no_node_behind(weights: Path, tmp_path: Path) -> None:
     command = [sys.executable, str(DEMO), "--world", "maze2d", "--rate", "20", "--weights", str(weights)]
     with (tmp_path / "log").open("w") as log:
         demo = subprocess.Popen([*command, "--out", str(tmp_path / "out")], stdout=log, stderr=log)
-        wait_until(lambda: demo.poll() is not None or len(descendants(demo.pid)) >= 3, "the nodes run")
+        wait_until(lambda: demo.poll() is not None or len(descendants(demo.pid)) >= 3, "the nodes")
         started = descendants(demo.pid)
         demo.send_signal(signal.SIGHUP)  # as a closed terminal; by the handler of an interrupt
         code = demo.wait(60)
     assert code == 130, (tmp_path / "log").read_text()
     assert len(started) >= 3
-    wait_until(lambda: not any(map(running, started)), "no process is left")
+    wait_until(lambda: not any(map(running, started)), "the end of all processes")

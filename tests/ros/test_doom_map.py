@@ -55,13 +55,6 @@ def test_the_estimators_run_unchanged_on_a_scenario_that_vizdoom_ships(probe: Pr
     assert np.isfinite(found).all() and math.isclose(found_m, true_m, rel_tol=0.5)
 
 
-def test_a_map_that_is_not_there_is_one_line_and_exit_code_2() -> None:
-    with NodeProcess("ngo_sim", "maze3d", {**SCENARIO, "map": "map07"}) as node:
-        assert node.wait() == 2, node.log
-        assert len(node.lines) == 1, node.log
-        assert node.lines[0].startswith("[FATAL]") and "map is 'map07'; my_way_home.wad has MAP01" in node.lines[0]
-
-
 def test_an_engine_that_dies_ends_the_node_with_one_line() -> None:
     with NodeProcess("ngo_sim", "maze3d", {**SCENARIO, "rate": 100.0}) as node:
         node.wait_for_log("ready: ")

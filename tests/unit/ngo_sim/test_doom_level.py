@@ -17,6 +17,7 @@ from ngo_sim.drivers import Action
 from ngo_sim.episodes import Episode, record_episode
 from ngo_sim.maze3d import Maze3D, Maze3DConfig
 from ngo_sim.rooms_level import rooms_textmap
+from tests.unit.ngo_sim.test_doom_map import blocks_of
 from tests.unit.ngo_sim.test_doom_wad import ROOM_TEXT
 
 HOME = Maze3DConfig(wad="my_way_home.wad", map="map01")
@@ -160,26 +161,21 @@ def level(seed: int, start: int = 0) -> str:
     return rooms_textmap(np.random.default_rng(seed), np.random.default_rng(start))
 
 
-def blocks(text: str, name: str) -> list[dict[str, str]]:
-    found = re.findall(rf"^{name}\{{(.*)\}}$", text, re.MULTILINE)
-    return [dict(part.split("=", 1) for part in block.rstrip(";").split(";")) for block in found]
-
-
 def test_a_level_follows_from_its_seed_and_the_start_from_another() -> None:
     assert level(20_000) == level(20_000) != level(20_001)
     one, other = level(20_000, start=1), level(20_000, start=2)
-    assert [blocks(one, name) for name in ("sector", "linedef")] == [
-        blocks(other, name) for name in ("sector", "linedef")
+    assert [blocks_of(one, name) for name in ("sector", "linedef")] == [
+        blocks_of(other, name) for name in ("sector", "linedef")
     ]
-    assert blocks(one, "thing")[-1] != blocks(other, "thing")[-1]
+    assert blocks_of(one, "thing")[-1] != blocks_of(other, "thing")[-1]
 
 
 @pytest.mark.parametrize("seed", range(20_000, 20_020))
 def test_the_lines_around_each_sector_are_closed(seed: int) -> None:
     text = level(seed)
-    sides, sectors = blocks(text, "sidedef"), blocks(text, "sector")
+    sides, sectors = blocks_of(text, "sidedef"), blocks_of(text, "sector")
     ends: dict[str, Counter[str]] = {}
-    for line in blocks(text, "linedef"):
+    for line in blocks_of(text, "linedef"):
         assert ("sideback" in line) == ("twosided" in line)
         for side, first, last in (("sidefront", "v1", "v2"), ("sideback", "v2", "v1")):
             if side in line:
@@ -189,7 +185,7 @@ def test_the_lines_around_each_sector_are_closed(seed: int) -> None:
     assert set(ends) == {str(number) for number in range(len(sectors))}
     assert not [sector for sector, balance in ends.items() if any(balance.values())]
     assert all(int(sector["heightceiling"]) >= int(sector["heightfloor"]) for sector in sectors)
-    assert sum(thing["type"] == "1" for thing in blocks(text, "thing")) == 1
+    assert sum(thing["type"] == "1" for thing in blocks_of(text, "thing")) == 1
 
 
 def test_levels_have_all_kinds_of_things() -> None:
@@ -198,7 +194,7 @@ def test_levels_have_all_kinds_of_things() -> None:
     assert "special=12;" in everything and 'textureceiling="F_SKY1"' in everything and "rotationfloor" in everything
     assert re.search(r"sector\{[^}]*special=(65|66|67|72|81);", everything)
     assert re.search(r'texturefloor="(FWATER1|NUKAGE1|BLOOD1|SLIME01|LAVA1)"', everything)
-    assert len({sector["heightfloor"] for text in texts for sector in blocks(text, "sector")}) > 20
+    assert len({sector["heightfloor"] for text in texts for sector in blocks_of(text, "sector")}) > 20
 
 
 def test_an_explorer_gets_somewhere_and_the_frames_follow_from_the_seed() -> None:

@@ -12,16 +12,20 @@ from ngo_sim.explorer import ExploringDriver
 from ngo_sim.maze2d import Maze2D, Maze2DConfig
 from ngo_sim.mazes import Maze, kruskal_maze
 
-PICTURE = ("#######", "#     #", "##### #", "#     #", "#######")
-HOOK = Maze(np.array([[block == "#" for block in row] for row in PICTURE]))
+
+def maze_of(picture: str, block_m: float = 1.0) -> Maze:
+    """A maze from its rows between bars: # is wall, the first is row 0."""
+    return Maze(np.array([[block == "#" for block in row] for row in picture.split("|")]), block_m)
+
+
+HOOK = maze_of("#######|#     #|##### #|#     #|#######")
 
 
 class HeavyRobot:
     """A disc with the momentum of the 3D world: 3 m corridors, radius 0.5 m, w <- 0.75 w +- 2.2 degrees."""
 
-    def __init__(self, maze: Maze, rng: np.random.Generator) -> None:
-        self.maze = maze
-        self.pose_xyyaw = np.array((*maze.block_center(rng.choice(maze.free_blocks())), rng.uniform(-3, 3)))
+    def __init__(self, maze: Maze, pose_xyyaw: np.ndarray) -> None:
+        self.maze, self.pose_xyyaw = maze, pose_xyyaw
         self._velocity, self._turn_rate = np.zeros(2), 0.0
         self._lows = np.argwhere(maze.walls)[:, ::-1] * maze.block_m
 
@@ -51,7 +55,8 @@ def drive(
         pose, maze = env.reset(seed=seed)[1]["pose_xyyaw"], env.maze
     else:
         maze = kruskal_maze(5, 5, rng, extra_openings=2, block_m=3.0)
-        robot = HeavyRobot(maze, rng)
+        start = np.array((*maze.block_center(rng.choice(maze.free_blocks())), rng.uniform(-3, 3)))
+        robot = HeavyRobot(maze, start)
         pose = robot.pose_xyyaw
     driver = PathDriver(maze, rng, goals, random_action_probability=random_action_probability)
     poses, actions = [pose], []
@@ -144,58 +149,26 @@ def test_a_driver_is_a_function_of_its_generator_and_the_poses(name: str) -> Non
     assert all(isinstance(action, Action) for action in actions(0))
 
 
-BLOCKS = ("###########",
-          "#         #",
-          "# ####### #",
-          "# #     # #",
-          "# # ### # #",
-          "# #   # # #",
-          "# ##### # #",
-          "#       # #",
-          "######### #",
-          "#         #",
-          "###########")  # fmt: skip
+SPIRAL = maze_of(
+    "###########|#         #|# ####### #|# #     # #|# # ### # #|# #   # # #|# ##### # #|#       # #|######### #|"
+    "#         #|###########",
+    block_m=3.0,
+)
 
 
-class Robot:
-    """A point with the 3D world's pace and inertia that stops at walls; blocks are 3 m."""
-
-    def __init__(self, picture: tuple[str, ...], x: float, y: float) -> None:
-        self._walls = np.array([[block == "#" for block in row] for row in picture])
-        self.pose_xyyaw = np.array((x, y, 0.3))
-        self._velocity, self._turn_rate = np.zeros(2), 0.0
-
-    def step(self, action: Action) -> None:
-        x, y, yaw = self.pose_xyyaw
-        thrust = 0.06 * np.array((math.cos(yaw), math.sin(yaw))) * (action == Action.FORWARD)
-        self._velocity = 0.88 * (self._velocity + thrust)
-        for axis in (0, 1):  # along a wall it slides
-            moved = np.array((x, y))
-            moved[axis] += self._velocity[axis]
-            if self._walls[int(moved[1] // 3), int(moved[0] // 3)]:
-                self._velocity[axis] = 0.0
-            else:
-                x, y = moved
-        self._turn_rate = 0.75 * self._turn_rate + math.radians((0.0, 2.2, -2.2)[action])
-        self.pose_xyyaw = np.array((x, y, math.remainder(yaw + self._turn_rate, math.tau)))
-
-    def block(self) -> tuple[int, int]:
-        return int(self.pose_xyyaw[1] // 3), int(self.pose_xyyaw[0] // 3)
-
-
-def explore(seed: int, steps: int) -> tuple[ExploringDriver, list[tuple[int, int]], list[Action]]:
-    driver, robot = ExploringDriver(np.random.default_rng(seed)), Robot(BLOCKS, 4.5, 4.5)
-    blocks, actions = [robot.block()], []
-    for _ in range(steps):
-        actions.append(driver.action(robot.pose_xyyaw))
-        robot.step(actions[-1])
-        blocks.append(robot.block())
-    return driver, blocks, actions
+def explored(seed: int) -> set[tuple[int, int]]:
+    """The blocks of the spiral that an explorer gets to."""
+    driver, robot = ExploringDriver(np.random.default_rng(seed)), HeavyRobot(SPIRAL, np.array((4.5, 4.5, 0.3)))
+    blocks = set()
+    for _ in range(6000):
+        robot.step(driver.action(robot.pose_xyyaw))
+        blocks.add(SPIRAL.block_at(*robot.pose_xyyaw[:2]))
+    return blocks
 
 
 def test_it_gets_about_in_a_spiral_that_it_has_no_plan_of() -> None:
-    free = sum(row.count(" ") for row in BLOCKS)
-    visited = [set(explore(seed, 6000)[1]) for seed in range(6)]
+    free = int((~SPIRAL.walls).sum())
+    visited = [explored(seed) for seed in range(6)]
     assert min(map(len, visited)) > 0.5 * free
     assert np.mean([len(blocks) for blocks in visited]) > 0.7 * free
     assert len(set.union(*visited)) == free

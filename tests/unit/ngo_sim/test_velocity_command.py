@@ -10,6 +10,7 @@ from ngo_sim.lidar import ScannerConfig
 from ngo_sim.maze2d import Maze2D
 from ngo_sim.simulation import Simulation
 from ngo_sim.velocity_command import VelocityCommand, VelocityLimits
+from tests.unit.ngo_sim.test_building2d import gap_to_walls
 
 LIMITS = VelocityLimits(speed_mps=1.0, turn_rate_rps=2.0, acceleration_mps2=0.5, turn_acceleration_rps2=4.0)
 
@@ -56,21 +57,12 @@ def test_a_commanded_robot_in_a_building_runs_into_a_wall_and_stops_before_it() 
     heading = before[2]
     moved = frame.true_pose_xyyaw[:2] - before[:2]
     assert moved @ (math.cos(heading), math.sin(heading)) > 0.0
-    gap = np.min(_gaps(world, world.step().true_pose_xyyaw[:2]))
+    walls = np.concatenate((world.plan.segments_m, world.plan.doors.leaves(np.zeros(1))[0]))
+    (gap,) = gap_to_walls(world.plan, world.step().true_pose_xyyaw[None, :2], walls)
     assert radius <= gap < radius + 0.05, "it stands before what it met, and touches nothing"
     world.command(-1.0, 0.0)
     world.step()
     assert not world.blocked, "it can back away"
-
-
-def _gaps(world: Building2d, point: np.ndarray) -> np.ndarray:
-    plan = world.plan
-    segments = np.concatenate((plan.segments_m, plan.doors.leaves(np.zeros(1))[0]))
-    along = segments[:, 2:] - segments[:, :2]
-    share = np.sum((point - segments[:, :2]) * along, axis=1) / np.maximum(np.sum(along**2, axis=1), 1e-12)
-    nearest = segments[:, :2] + np.clip(share, 0.0, 1.0)[:, None] * along
-    circles = np.hypot(*(plan.circles_m[:, :2] - point).T) - plan.circles_m[:, 2]
-    return np.concatenate((np.hypot(*(nearest - point).T), circles))
 
 
 def test_a_robot_with_a_driver_of_its_own_takes_no_commands() -> None:

@@ -29,18 +29,18 @@ def over_the_wire(message: Any) -> Any:
     return deserialize_message(serialize_message(message), type(message))
 
 
-def update(loops: int) -> WholeTrajectory:
-    """A trajectory of five frames with so many loops."""
-    rng = np.random.default_rng(1)
+def with_loops(loops: int, frames: int = 500) -> WholeTrajectory:
+    """A trajectory with so many loops, some of them with weights beyond 0 and 1."""
+    rng = np.random.default_rng(loops)
     return WholeTrajectory(
-        stamps_ns=np.arange(1, 6) * 1_500_000_001,
-        poses_xyyaw=rng.normal(size=(5, 3)),
-        odometry_xyyaw=rng.normal(size=(5, 3)),
-        online_xyyaw=rng.normal(size=(5, 3)),
-        moved_m=rng.random(5),
-        loops=np.array([[0, 4], [1, 3]])[:loops],
-        odometry_std=rng.random((4, 3)),
-        loop_weights=np.array([0.25, 1.0])[:loops],
+        stamps_ns=np.arange(1, frames + 1) * 1_500_000_001,
+        poses_xyyaw=rng.normal(0.0, 10.0, (frames, 3)),
+        odometry_xyyaw=rng.normal(size=(frames, 3)),
+        online_xyyaw=rng.normal(size=(frames, 3)),
+        moved_m=rng.random(frames),
+        loops=rng.integers(0, frames, (loops, 2)),
+        odometry_std=rng.random((frames - 1, 3)),
+        loop_weights=rng.uniform(-0.5, 1.5, loops),
         loop_relative_xyyaw=rng.normal(size=(loops, 3)),
         loop_std=rng.random((loops, 3)),
     )
@@ -107,7 +107,7 @@ def test_odometry_has_the_pose_and_the_mean_velocity() -> None:
 
 
 def test_a_trajectory_keeps_every_number() -> None:
-    expected = update(loops=0)
+    expected = with_loops(0)
     message: Trajectory = over_the_wire(messages.trajectory_message(expected, "map"))
     assert messages.to_ns(message.header.stamp) == expected.stamps_ns[-1]
     np.testing.assert_array_equal(message.stamps_ns, expected.stamps_ns)
@@ -180,23 +180,6 @@ def test_two_messages_share_no_memory() -> None:
     first = writer.write(1, stamps_ns, poses_xyyaw)
     writer.write(2, stamps_ns + 7, poses_xyyaw + 1.0)
     assert deserialize_message(first, Path) == plain_path("map", 1, stamps_ns, poses_xyyaw)
-
-
-def with_loops(loops: int, frames: int = 500) -> WholeTrajectory:
-    """A trajectory with so many loops, some of them with weights beyond 0 and 1."""
-    rng = np.random.default_rng(loops)
-    return WholeTrajectory(
-        stamps_ns=np.arange(1, frames + 1) * 1_500_000_001,
-        poses_xyyaw=rng.normal(0.0, 10.0, (frames, 3)),
-        odometry_xyyaw=rng.normal(size=(frames, 3)),
-        online_xyyaw=rng.normal(size=(frames, 3)),
-        moved_m=rng.random(frames),
-        loops=rng.integers(0, frames, (loops, 2)),
-        odometry_std=rng.random((frames - 1, 3)),
-        loop_weights=rng.uniform(-0.5, 1.5, loops),
-        loop_relative_xyyaw=rng.normal(size=(loops, 3)),
-        loop_std=rng.random((loops, 3)),
-    )
 
 
 @pytest.mark.parametrize("frame_id", ["map", "m", "mapp", "a_long_frame/of_many_parts", "käfig"])
@@ -285,7 +268,7 @@ def test_a_key_scan_comes_as_it_was_sent() -> None:
         {"x": float("nan")},
         {"stamp": KeyScan().stamp},
     ],
-    ids=str,
+    ids=lambda changes: str(changes)[:50],
 )
 def test_a_bad_key_scan_is_refused_in_one_line(changes: dict[str, Any]) -> None:
     trajectory = ScanTrajectory()
