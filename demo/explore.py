@@ -69,7 +69,7 @@ class ExploreDemo:
     def __init__(self, config: ExploreConfig, out: Path, domain_id: int | None = None) -> None:
         """Run in a ROS domain that is free, or in ``domain_id``."""
         self._config, self._out, self._domain_id = config, out, domain_id
-        self._seen = Seen(Building(config.seed, FloorPlanConfig(scale=config.scale, people=0)))
+        self._seen = Seen(*Building(config.seed, FloorPlanConfig(scale=config.scale, people=0)).exact_scans())
         self._truth: list[np.ndarray] = []
         self._grid: Grid | None = None
         self._told: dict[type, Any] = {}  # the newest of what the explorer publishes

@@ -162,7 +162,7 @@ def _places(kind: str, arguments: Arguments) -> Iterator[tuple[str, str, Callabl
 
 
 def _place(make: Callable[[], ExploredWorld]) -> Place:
-    return Place(make, Seen(make()))
+    return Place(make, Seen(*make().exact_scans()))
 
 
 def _row(name: str, kind: Kind, arguments: Arguments) -> Row:
@@ -201,6 +201,8 @@ def scores(run: Explored, seen: Seen) -> dict[str, float]:
         "ended_early": float(run.ended and run.coverage[-1] < 0.98),
         "ended": float(run.ended),
         "coverage": float(run.coverage[-1]),
+        "in_reach": run.in_reach,
+        "in_reach_early": float(run.ended and run.in_reach < 0.98),
         "path_m": float(run.path_m[-1]),
         "time_s": float(run.time_s[-1]),
         "iou": 0.5 * sum(intersections(run.found, seen.map)),

@@ -75,7 +75,7 @@ def test_a_robot_that_estimates_its_poses_has_a_map_and_says_how_wrong_they_are(
 
 def test_a_tiny_maze_is_explored_to_its_end_with_and_without_its_map() -> None:
     config = ExplorerConfig(radius_m=TINY.radius_m)
-    seen = Seen(Maze(5, TINY))
+    seen = Seen(*Maze(5, TINY).exact_scans())
     for run in (
         explore(Maze(5, TINY), seen, config, DriveConfig(), most_s=400.0, estimator=DriftsSteadily),
         drive_known_tour(Maze(5, TINY), seen, config, DriveConfig(), most_s=400.0),

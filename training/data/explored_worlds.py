@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Protocol
 
 import numpy as np
+from scipy.ndimage import label
 
 from ngo_estimator.mapping.range_scan import RangeScan, range_scan
 from ngo_recordings.scan_stream import LidarScan, WheelPose
@@ -25,6 +26,7 @@ from training.data.lidar_drives import simulated_stamps_ns
 
 _APART_M = 0.4  # between two places that say what can be seen
 _RAYS = 720
+_GAP_M = 0.05  # between the leaf of a door that is shut and its frame, at most
 _RANGE_M = 12.0  # of the robot's lidar
 
 WHEELS = {
@@ -64,6 +66,10 @@ class ExploredWorld(Protocol):
         """What can be seen: exact scans all around, and their poses ``(n, 3)`` all over where the robot can go."""
         ...
 
+    def in_reach(self, poses_xyyaw: np.ndarray) -> np.ndarray:
+        """``(n,)`` whether a way leads to places ``(n, 3)`` from where the robot is, as doors stand now."""
+        ...
+
 
 class Building:
     """A building of a seed; a robot with a lidar of 270 degrees and 12 m, and with ``wheels`` if it tells of any."""
@@ -80,6 +86,7 @@ class Building:
         self._has_wheels = wheels is not None
         self._building = Building2d(plan, self._scanner, wheels or WheelsConfig(), self._driver)
         self._building.reset(seed)
+        self._sight: Sight | None = None
 
     @property
     def plan(self) -> FloorPlan:
@@ -95,7 +102,8 @@ class Building:
         stamp_ns, wheels_ns = simulated_stamps_ns(np.array((frame.stamp_s, frame.wheel_stamp_s))).tolist()
         wheels = [WheelPose(wheels_ns, frame.wheel_pose_xyyaw)] if self._has_wheels else []
         records: list[LidarScan | WheelPose] = [*wheels, measured_scan(self._scanner, stamp_ns, frame.ranges_m)]
-        return Sight(frame.stamp_s, frame.true_pose_xyyaw, scan, self._building.blocked, stamp_ns, records)
+        self._sight = Sight(frame.stamp_s, frame.true_pose_xyyaw, scan, self._building.blocked, stamp_ns, records)
+        return self._sight
 
     def exact_scans(self) -> tuple[list[RangeScan], np.ndarray]:
         """Exact scans all over where the robot can go; doors that it cannot rely on are shut, and glass is a wall."""
@@ -107,9 +115,9 @@ class Building:
         exact = ScannerConfig(
             rays=_RAYS, field_of_view_deg=360.0, range_max_m=_RANGE_M, noise_m=0.0, noise_per_m=0.0, dropout=0.0
         )
-        swing = np.column_stack((plan.doors.hinges_m, plan.doors.widths_m))
+        doors = replace(plan.doors, widths_m=plan.doors.widths_m + _GAP_M)  # nothing is seen behind those that are shut
+        swing = np.column_stack((doors.hinges_m, doors.widths_m))
         world = ray_world(plan.segments_m, np.zeros(len(plan.glass), np.bool_), plan.circles_m, swing)
-        doors = plan.doors
         opened = np.where(doors.passable, doors.angles_rad[:, 0], 0.0)[None]
         leaves = np.repeat(doors.leaves_at(opened), len(poses), axis=0)
         ranges = cast_scans(
@@ -122,6 +130,20 @@ class Building:
             np.random.default_rng(0),
         )
         return [range_scan(exact.base_angles_rad(), row.astype(float), np.zeros(3), _RANGE_M) for row in ranges], poses
+
+    def in_reach(self, poses_xyyaw: np.ndarray) -> np.ndarray:
+        """By the leaves of the doors where they are now."""
+        plan, doors = self._building.plan, self._building.plan.doors
+        if not len(doors.hinges_m) or self._sight is None:
+            return np.ones(len(poses_xyyaw), np.bool_)
+        opened = np.repeat(doors.opened_rad(np.array((self._sight.time_s,))), doors.angles_rad.shape[1], axis=0).T
+        stand = replace(doors, angles_rad=opened, passable=np.ones(len(opened), np.bool_))
+        areas, _ = label(RouteMap(replace(plan, doors=stand), self.radius_m).safe, np.ones((3, 3)))
+        cells = np.argwhere(areas)
+        robot = self._sight.pose_xyyaw[1::-1] / CELL_M
+        here = areas[tuple(cells[np.argmin(np.sum((cells + 0.5 - robot) ** 2, axis=1))])]
+        row, column = (poses_xyyaw[:, 1::-1] / CELL_M).astype(np.int64).T
+        return np.asarray(areas[row, column] == here)
 
 
 class Maze:
@@ -156,3 +178,7 @@ class Maze:
             cast_rays(maze.walls, maze.block_m, x, y, yaw, np.cos(angles), np.sin(angles), colors, seen)
             scans.append(range_scan(angles, seen[:, 3].astype(np.float64), np.zeros(3), self.range_m))
         return scans, poses
+
+    def in_reach(self, poses_xyyaw: np.ndarray) -> np.ndarray:
+        """All of them: a maze has no doors."""
+        return np.ones(len(poses_xyyaw), np.bool_)

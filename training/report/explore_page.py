@@ -12,6 +12,8 @@ _COLUMNS = (
     Column("path_m", "Whole path, m", number),
     Column("coverage", "Seen at the end, %", number, 100.0),
     Column("ended_early", "Ended under 98 %, %", number, 100.0),
+    Column("in_reach", "Seen of what is in reach at the end, %", number, 100.0),
+    Column("in_reach_early", "Ended under 98 % of it, %", number, 100.0),
     Column("iou", "IoU of the map", number),
     Column("iou_true_poses", "IoU at true poses", number),
     Column("ate_m", "ATE at 95 %, m", number),
@@ -35,10 +37,13 @@ One run a place and rule. Robot, map, path follower and limits are the same in a
 smallest frontier, pace and blacklist. Intervals are of 95 %, by resampling places; few places make them too narrow.
 
 Coverage counts the free cells that exact rays see from all places where the robot can go; what a robot has seen is
-entered at its true poses. The ratio is the geometric
-mean over the places where both rules came to 95 %; a mean path is over those where its own rule did, so that a
-rule which gives long places up has a short one. The tour on the known map is searched for (insertion, 2-opt, or-opt,
-large neighbourhoods); the shortest one may be a little shorter.
+entered at its true poses. Doors that may shut are shut for this, and fill their frames: what lies behind them does not
+count. A robot may go in there, and the door may shut behind it. What is in reach at the end is what counts and can be
+seen from where a way led then, by the leaves of all doors.
+
+The ratio is the geometric mean over the places where both rules came to 95 %; a mean path is over those where its own
+rule did, so that a rule which gives long places up has a short one. The tour on the known map is searched for
+(insertion, 2-opt, or-opt, large neighbourhoods); the shortest one may be a little shorter.
 IoU is the mean of free and occupied cells of the robot's own map beside those exact rays, a map of
 own poses aligned as for the ATE; at true poses it is that of
 the scans of the same path. Decisions are timed as

@@ -6,12 +6,14 @@ import math
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
+from itertools import compress
 from typing import Protocol
 
 import numpy as np
 
 from ngo_estimator.data.relative_step import RelativeStep
 from ngo_estimator.mapping.occupancy_grid import UNKNOWN, OccupancyConfig, OccupancyGrid, OccupancyMap
+from ngo_estimator.mapping.range_scan import RangeScan
 from ngo_estimator.mapping.scan_map import ScanMap
 from ngo_explorer.exploration import Exploration
 from ngo_explorer.known_map import KnownMap
@@ -35,8 +37,9 @@ class Explored:
 
     ``path_m``, ``coverage`` and ``time_s`` ``(n,)``: length of the path, share seen of what can be seen, and time.
     ``poses_xyyaw`` ``(m, 3)`` true. ``ended`` says whether the robot ended it by itself. ``found`` is its own map,
-    aligned with the truth as a whole, ``at_true_poses`` that of the same scans at true poses, and ``errors`` are those
-    of its own poses, by the metric's key: ``ate_m`` when ``ENOUGH`` had been seen, ``ate_end_m`` at the end.
+    aligned with the truth as a whole, ``at_true_poses`` that of the same scans at true poses. ``in_reach`` is the share
+    seen at the end of what can be seen from where a way led then: a door may have shut. ``errors`` are those of its own
+    poses, by the metric's key: ``ate_m`` when ``ENOUGH`` had been seen, ``ate_end_m`` at the end.
     """
 
     path_m: np.ndarray
@@ -48,6 +51,7 @@ class Explored:
     ended: bool
     found: OccupancyMap
     at_true_poses: OccupancyMap
+    in_reach: float
     errors: dict[str, float] = field(default_factory=dict)
 
     def path_to(self, coverage: float) -> float:
@@ -113,10 +117,10 @@ class TruePosesMap:
 
 
 class Seen:
-    """What can be seen of a world, and how much of it a map holds."""
+    """What can be seen of a world, by exact scans from ``poses`` ``(n, 3)``, and how much of it a map holds."""
 
-    def __init__(self, world: ExploredWorld) -> None:
-        scans, poses = world.exact_scans()
+    def __init__(self, scans: list[RangeScan], poses: np.ndarray) -> None:
+        self.scans, self.poses = scans, poses
         grid = OccupancyGrid(RESOLUTION_M)
         for begin in range(0, len(scans), 200):
             grid.add(scans[begin : begin + 200], poses[begin : begin + 200])
@@ -124,12 +128,19 @@ class Seen:
         self._free = self.map.values == 0
         self._count = int(np.count_nonzero(self._free))
 
+    def in_reach(self, world: ExploredWorld) -> Seen:
+        """What can be seen of it from where a way leads to from where the robot is, as doors stand now."""
+        near = world.in_reach(self.poses)
+        return self if near.all() else Seen(list(compress(self.scans, near)), self.poses[near])
+
     def free_points(self) -> np.ndarray:
         """Middles ``(n, 2)`` of the free cells that can be seen."""
         return self.map.origin_xy + (np.argwhere(self._free)[:, ::-1] + 0.5) * RESOLUTION_M
 
     def coverage(self, found: OccupancyMap) -> float:
-        """Share of the free cells that can be seen which a map knows."""
+        """Share of the free cells that can be seen which a map knows; 1 where there are none."""
+        if not self._count:
+            return 1.0
         column, row = np.rint((found.origin_xy - self.map.origin_xy) / RESOLUTION_M).astype(int).tolist()
         rows, columns = self._free.shape
         top, left = max(0, row), max(0, column)
@@ -167,7 +178,7 @@ def drive_known_tour(
     known = KnownMap(config.radius_m, config.comfort_m)
     known.update(seen.map.values, RESOLUTION_M, seen.map.origin_xy)
     follower = PathFollower(drive, config)
-    for path in known_tour(world, known, run.sight.pose_xyyaw[:2], config.need_m(RESOLUTION_M)):
+    for path in known_tour(seen.scans, seen.poses, known, run.sight.pose_xyyaw[:2], config.need_m(RESOLUTION_M)):
         follower.follow(path, float(np.arctan2(*(path[-1] - path[max(0, len(path) - 5)])[::-1])))
         while follower.state == DRIVING and run.sight.time_s < most_s:
             run.look()
@@ -268,8 +279,8 @@ class _Run:
             errors["ate_end_m"] = errors.pop("ate_m")
             errors |= {key: value for key, value in (self._enough or {}).items() if key == "ate_m"}
         true = _trinary(self._grid.cells(_OCCUPANCY))
-        counted = self._collisions, self._ended
-        return Explored(path, coverage, times, truth.poses_xyyaw, decisions, *counted, found, true, errors)
+        counted, in_reach = (self._collisions, self._ended), self._seen.in_reach(self._world).coverage(true)
+        return Explored(path, coverage, times, truth.poses_xyyaw, decisions, *counted, found, true, in_reach, errors)
 
 
 def _trinary(found: OccupancyMap) -> OccupancyMap:

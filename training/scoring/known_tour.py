@@ -7,6 +7,7 @@ it shorter (large neighbourhood search, Shaw 1998). It is no proof: the best tou
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -14,10 +15,10 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import dijkstra
 from scipy.spatial import cKDTree
 
+from ngo_estimator.mapping.range_scan import RangeScan
 from ngo_explorer.known_map import KnownMap
 from ngo_explorer.planner import cost_field, line_is_free, plan_path
 from ngo_explorer.tours import tour
-from training.data.explored_worlds import ExploredWorld
 
 _CELL_M = 0.25  # of what places see
 _JOINED_M = 0.75  # places this near are neighbours, if the way is free
@@ -59,12 +60,16 @@ class Sights:
         return float(self.ways_m[tour_stops[:-1], self.stops[tour_stops[1:]]].sum())
 
 
-def known_tour(world: ExploredWorld, known: KnownMap, start_xy: np.ndarray, need_m: float) -> list[np.ndarray]:
-    """Paths ``(n, 2)`` from place to place, in order; all that is asked for is seen at the end of the last."""
-    scans, poses = world.exact_scans()
+def known_tour(
+    scans: Sequence[RangeScan], poses: np.ndarray, known: KnownMap, start_xy: np.ndarray, need_m: float
+) -> list[np.ndarray]:
+    """Paths ``(n, 2)`` from place to place, in order; all that is asked for is seen at the end of the last.
+
+    scans: exact ones, from ``poses`` ``(n, 3)`` all over where the robot can go.
+    """
     field = cost_field(known, start_xy, need_m)
     rows, columns = known.cells(poses[:, :2]).T // known.block
-    near = np.flatnonzero(field[rows, columns] >= 0)
+    near = np.flatnonzero(field[rows, columns] >= 0).tolist()
     points = np.concatenate((start_xy[None], poses[near, :2]))
     nearest = 1 + int(np.argmin(np.hypot(*(points[1:] - start_xy).T)))
     seen = _seen([scans[number].ends + poses[number, :2] for number in near], points[1:])

@@ -86,9 +86,12 @@ class Doors:
 
     def leaves(self, times_s: Floats) -> Floats:
         """(times, n, 4) the leaves as segments x0, y0, x1, y1 at some times."""
+        return self.leaves_at(self.opened_rad(times_s))
+
+    def opened_rad(self, times_s: Floats) -> Floats:
+        """(times, n) the angles by which they are opened at some times."""
         epochs = np.floor((np.asarray(times_s)[:, None] + self.phases_s) / self.periods_s).astype(np.int64)
-        opened = self.angles_rad[np.arange(len(self.hinges_m)), epochs % _DOOR_EPOCHS]
-        return self.leaves_at(opened)
+        return np.asarray(self.angles_rad[np.arange(len(self.hinges_m)), epochs % _DOOR_EPOCHS])
 
     def leaves_at(self, opened_rad: Floats) -> Floats:
         """(k, n, 4) the leaves as segments where they are opened by angles (k, n)."""
