@@ -114,6 +114,34 @@ def test_wrong_loops_are_recognised(group: int, metric: bool) -> None:
     assert worst(solution.poses, true) < 0.5 * worst(problem.poses, true)
 
 
+@pytest.mark.parametrize("seed", [3, 4])
+def test_two_floors_that_look_alike_are_not_laid_upon_each_other(seed: int) -> None:
+    """Four rounds on each: wrong loops join the same places of both, are more than the right ones, and all agree.
+
+    To believe them costs less, but overturns much of what is believed.
+    """
+    rng, wrong, right, std = np.random.default_rng(seed), 300, 200, 3.0 * STEP_STD
+    floor = np.tile((1.0, 0.0, 0.0), (4 * ROUND, 1))
+    floor[:: ROUND // 4, 2] = math.pi / 2.0
+    steps = np.concatenate((floor, np.tile((1.0, 0.0, 0.0), (40, 1)), floor))
+    true, other = chain_poses(steps), len(floor) + 40
+    first = rng.integers(0, len(floor) - ROUND, right)
+    inside = np.stack((first, first + ROUND), axis=1) + other * rng.integers(0, 2, right)[:, None]
+    first = rng.integers(0, len(floor), wrong)
+    across = np.stack((first, other + first % ROUND + ROUND * rng.integers(0, 4, wrong)), axis=1)
+    pairs = np.concatenate((inside, across))
+    relative = np.concatenate((between(true[inside[:, 0]], true[inside[:, 1]]), np.zeros((wrong, 3))))
+    relative += rng.normal(0.0, LOOP_STD, relative.shape)
+    loops = RelativePoses.of_deviations(pairs, relative, np.tile(LOOP_STD, (len(pairs), 1)))
+    nodes = np.stack((np.arange(len(steps)), np.arange(1, len(true))), axis=1)
+    measured = steps + rng.normal(0.0, std, steps.shape)
+    chain = RelativePoses.of_deviations(nodes, measured, np.tile(std, (len(steps), 1)))
+    believed = (
+        Robust().correct(GraphProblem(chain_poses(measured), chain, loops, np.ones(len(loops)))).loop_weights > 0.0
+    )
+    assert believed[:right].mean() > 0.95 and not believed[right:].any()
+
+
 def test_loops_without_trust_change_nothing() -> None:
     problem, _ = square(2, 3)
     solution = Robust().correct(replace(problem, trust=np.zeros(len(problem.loops))))

@@ -185,7 +185,8 @@ def _reconsidered(
 ) -> CorrectedGraph:
     """The solution after its refused loops that agree with each other were asked again, while that lowers the cost.
 
-    Where a stretch of the graph lies wrongly, the right loops that lead there are refused, and say the same of it.
+    Where a stretch of the graph lies wrongly, the right loops that lead there are refused, and say the same of it. What
+    is believed elsewhere stays: loops that overturn most of it are wrong in one way, as between floors that look alike.
     """
     scaled = problem.scaled(solution.scale)
     chain, loops = ChainUncertainty(scaled.steps), scaled.loops
@@ -199,9 +200,11 @@ def _reconsidered(
         asked, structure = _affordable(replace(scaled, poses=poses), np.append(np.flatnonzero(believed), again))
         poses = graduate(asked, poses, report=report, structure=structure)[0]
         other = _polished(problem, poses, solution.scale, solution.loops_from_nothing, least_scale)
-        little = other.cost > _LESS * solution.cost
-        solution = min(solution, other, key=lambda each: each.cost)
-        if little:
+        kept = believed & (other.loop_weights > 0.0)
+        if other.cost >= solution.cost or kept.sum() < _AGREE * believed.sum():
+            break
+        much, solution = other.cost < _LESS * solution.cost, other
+        if not much:
             break
     return solution
 
