@@ -1,4 +1,4 @@
-"""The JSON and the page of the results, on errors that are known; and the mazes that figures show."""
+"""The JSON of the results, on errors that are known; and the mazes that figures show."""
 
 import numpy as np
 import pytest
@@ -8,7 +8,6 @@ from training.data.episodes import GROUP, simulate
 from training.data.worlds import world_named
 from training.report import tables
 from training.report.maze_views import in_maze, maze_and_start
-from training.report.results_page import page
 from training.scoring.scores import METRICS
 from training.scoring.table import Measured
 
@@ -56,37 +55,6 @@ def test_a_constant_turn_is_found_as_heading_bias() -> None:
     bias = tables.heading_bias_json(relative, truth)
     assert bias["mean"] == pytest.approx(0.02, rel=1e-5)
     assert 0.0099 < bias["ci95"][0] < bias["ci95"][1] < 0.0301
-
-
-def result() -> dict[str, object]:
-    return {
-        "command": "python -m training.results --world maze2d",
-        "revision": "abc",
-        "split": "validation",
-        "trajectories": 4,
-        "steps": 8,
-        "seeds": [0, 1],
-        "tables": {"perfect": tables.table_json(TABLE, (4, 8), 8, WORLD)},
-        "paired": {"perfect": tables.paired_json(TABLE, 8, WORLD)},
-        "local_bias_deg": {"perfect": {"mean": -0.0012, "ci95": [-0.002, 0.0001]}},
-        "path_m": {"perfect": {"4": 10.0, "8": 20.0}},
-        "trainings": {"ngo_5-seed0": {"command": "python -m x", "seconds": 90.0, "datapoints_per_s": 12.5}},
-    }
-
-
-def test_the_page_has_what_the_json_has() -> None:
-    text = page(result(), {"a.png": "What it shows."}, WORLD)
-    lines = text.splitlines()
-    (local,) = [line for line in lines if line.startswith("| `local` | odometry")]
-    assert local.count("| 2.50 [") == len(KEYS)
-    (ours,) = [line for line in lines if line.startswith("| `ngo_5` | our")]
-    assert "(0.250 to 0.450)" in ours
-    (pair,) = [line for line in lines if line.startswith("| `ngo_5` | `gtsam` |")]
-    assert "| -50.0 % [" in pair and pair.endswith("| yes |")
-    assert "-0.0012 deg [-0.0020, +0.0001]" in text
-    assert "![What it shows.](images/a.png)" in text
-    assert "| `ngo_5-seed0` | 1.50 min | 12.5 /s |  | `python -m x` |" in lines
-    assert "seeds 0 and 1" in text
 
 
 @pytest.mark.parametrize("index", [1, GROUP + 1])
