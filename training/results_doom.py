@@ -24,7 +24,7 @@ from ngo_estimator.slam import online_trajectory
 from ngo_estimator.slam.online_trajectory import OnlineTrajectory
 from training.baselines.graph_settings import load_settings
 from training.common.command_line import check_at_least, run_command
-from training.data.doom_drives import TEST_MAPS, TRAIN_MAPS, VALIDATION_MAPS, Map, map_drive
+from training.data.doom_drives import TEST_MAPS, VALIDATION_MAPS, Map, map_drive
 from training.data.episodes import images_of
 from training.data.features import features_of
 from training.data.worlds import World, world_named
@@ -34,7 +34,6 @@ from training.report.folders import Folders
 from training.scoring import doom_rows
 from training.scoring.doom_rows import (
     ROWS,
-    ActionsFit,
     Estimate,
     Features,
     errors_of,
@@ -49,7 +48,6 @@ from training.scoring.table import Drive, Measured, Row, column, intervals, kept
 
 _FIRST_SEED = {"validation": 10_000, "test": 20_000}
 _MAPS = {"validation": VALIDATION_MAPS, "test": TEST_MAPS}
-_FIT_SEED, _FIT_MAPS = 5_000, 12
 _TRUTH = "truth"
 _WORLD = "doom"
 
@@ -111,25 +109,25 @@ class Drives:
         watch = load_description(known, FAMILIARITY)["sha256"] if known.exists() else None
         self._identity = f"{json.dumps([described['sha256'], described_place['sha256']])} {watch}"
 
-    def features(self, of: Map, seed: int, drawn_start: bool = False) -> Features:
-        """What the networks make of a drive, its ``actions`` and ``poses``."""
+    def features(self, of: Map, seed: int) -> Features:
+        """What the networks make of a drive."""
 
         def made() -> Features:
-            world, drive = world_named(_WORLD), map_drive(of, seed, self._frames, drawn_start=drawn_start)
+            world, drive = world_named(_WORLD), map_drive(of, seed, self._frames)
             features = features_of(world, drive, self._weights, (self.local, self.place))
-            if self._watch is not None:
-                features = judged(self._watch, images_of(world, drive), drive.actions, features)
-            return {"actions": drive.actions, "poses": drive.poses_xyyaw, **features}
+            if self._watch is None:
+                return features
+            return judged(self._watch, images_of(world, drive), drive.actions, features)
 
-        name = self._name(of, seed, drawn_start)
+        name = self._name(of, seed)
         return kept(self.folder / f"{name}.npz", f"{name} {self._identity}", made)
 
-    def _name(self, of: Map, seed: int, drawn_start: bool) -> str:
-        return f"{map_name(of)}-{seed}-{self._frames}{'-drawn' * drawn_start}"
+    def _name(self, of: Map, seed: int) -> str:
+        return f"{map_name(of)}-{seed}-{self._frames}"
 
     def of_table(self, of: Map, seed: int) -> Drive:
         """A drive of the table."""
-        name = self._name(of, seed, drawn_start=False)
+        name = self._name(of, seed)
         return Drive(name, f"{name} {self._identity}", partial(self.features, of, seed))
 
 
@@ -147,12 +145,9 @@ def judged(watch: FamiliarityWatch, images: torch.Tensor, actions: np.ndarray, f
 
 def table_rows(arguments: Arguments, drives: Drives) -> dict[str, Row]:
     """The rows of the table, and one of the drives themselves."""
-    fitted = [drives.features(of, _FIT_SEED, drawn_start=True) for of in TRAIN_MAPS[:_FIT_MAPS]]
-    actions = ActionsFit.of([(one["actions"], one["poses"]) for one in fitted])
     settings = load_settings(arguments.out / f"{_WORLD}.gtsam.json")
     core = OnlineTrajectory.load(arguments.weights / _WORLD, world=_WORLD)
     estimators = {
-        "actions_only": (actions.estimate, str(actions.weights.tolist())),
         "local": (local, ""),
         "gtsam": (gtsam_graph(settings, drives.place.pair_head), json.dumps(dataclasses.asdict(settings))),
         "ours": (ours(core), str(core.identity)),

@@ -15,7 +15,6 @@ pytestmark = pytest.mark.slow
 
 def test_choices_and_table_with_little(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     write_untrained(tmp_path / "weights" / "doom", "doom")
-    monkeypatch.setattr(results_doom, "_FIT_MAPS", 1)
     monkeypatch.setitem(results_doom._MAPS, "test", (("take_cover.wad", "MAP01"),))
     monkeypatch.setattr(results_doom, "draw_levels", lambda path: None)
     monkeypatch.setattr(tune_doom, "VALIDATION_MAPS", (("simpler_basic.wad", "MAP01"),))

@@ -14,7 +14,6 @@ from training.report.pictures import panels, save
 from training.scoring.doom_rows import METRICS, ROWS
 
 _TITLES = {
-    "actions_only": "linear fit of the latest twelve actions",
     "local": "odometry of the local network",
     "gtsam": "robust pose graph (GTSAM), same odometry and loops, tuned on validation maps",
     "ours": "corrected (`ngo_node`)",
@@ -25,7 +24,7 @@ _COLUMNS = {
     "within_3_std": "Poses within three published deviations",
 }
 _RETURNS = 0.1
-_COLOURS = {"truth": "0.6", "actions_only": "tab:red", "local": "tab:orange", "gtsam": "tab:green", "ours": "tab:blue"}
+_COLOURS = {"truth": "0.6", "local": "tab:orange", "gtsam": "tab:green", "ours": "tab:blue"}
 
 
 def page(result: dict[str, Any], weights: Path) -> str:
@@ -88,15 +87,14 @@ def _trainings(weights: Path) -> list[list[str]]:
 
 def draw(path: Path, tracks: dict[str, dict[str, np.ndarray]]) -> None:
     """Draw the paths ``(steps, 2)`` of all rows on the first drive of each map."""
-    shown = [row for row in _COLOURS if row != "actions_only"]  # which leaves the picture
     figure, axes = panels(len(tracks), 5, 3.2, 3.0)
     for axis, (name, lines) in zip(axes, tracks.items(), strict=True):
-        for row in (row for row in lines if row in shown):
+        for row in lines:
             axis.plot(*lines[row].T, color=_COLOURS[row], linewidth=2.0 if row == "truth" else 0.8)
         axis.set_title(name, fontsize=8)
         axis.set_aspect("equal")
         axis.axis("off")
-    handles = [Line2D([], [], color=_COLOURS[row], label=row) for row in shown]
+    handles = [Line2D([], [], color=_COLOURS[row], label=row) for row in _COLOURS]
     figure.legend(handles=handles, loc="lower right", ncols=2)
     save(figure, path, dpi=70)
 

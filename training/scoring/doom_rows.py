@@ -13,20 +13,18 @@ from ngo_estimator.networks.place_encoder import PairHead
 from ngo_estimator.slam.online_trajectory import OnlineTrajectory
 from training.baselines.loop_factors import found_loops
 from training.baselines.pose_graph import PoseGraphSettings, optimize
-from training.data.batches import action_histories, alike, relative_poses
+from training.data.batches import alike
 from training.scoring.metrics import absolute_error_m, trajectory_error, within
 from training.scoring.online_estimate import carried_covariances, online_run, steps_of, with_origin
 from training.scoring.row_estimators import seen_in
 
-ROWS = ("actions_only", "local", "gtsam", "ours")
+ROWS = ("local", "gtsam", "ours")
 METRICS = ("translation_percent", "ate_m", "within_3_std")
-WINDOW = 100
-"""Steps over which errors of steps add up where their deviations are fitted: they last, and a trajectory is a sum."""
 
 _AGO = 48
 
 Features = dict[str, np.ndarray]
-"""Of one drive, as of ``features_of``, with ``actions`` ``(steps,)`` uint8."""
+"""Of one drive, as of ``features_of``."""
 
 
 @dataclass(frozen=True)
@@ -39,43 +37,6 @@ class Estimate:
     poses: np.ndarray
     published: np.ndarray
     covariances: np.ndarray
-
-
-@dataclass(frozen=True)
-class ActionsFit:
-    """Steps as a linear function of the latest twelve actions.
-
-    ``weights`` ``(inputs, 3)``; ``covariance`` ``(3, 3)`` of a step, so that it holds over ``WINDOW`` steps.
-    """
-
-    weights: np.ndarray
-    covariance: np.ndarray
-
-    @classmethod
-    def of(cls, drives: list[tuple[np.ndarray, np.ndarray]]) -> ActionsFit:
-        """The least squares fit to ``drives``: actions ``(steps,)`` and true poses ``(steps + 1, 3)`` of each."""
-        inputs = [_action_inputs(actions) for actions, _ in drives]
-        steps = [relative_poses(poses).numpy() for _, poses in drives]
-        weights = np.linalg.lstsq(np.concatenate(inputs), np.concatenate(steps))[0]
-        sums = np.concatenate([_windows(one @ weights - step) for one, step in zip(inputs, steps, strict=True)])
-        return cls(weights, np.diag((sums**2).mean(0) / WINDOW))
-
-    def estimate(self, features: Features) -> Estimate:
-        """The trajectory of a drive."""
-        relative = _action_inputs(features["actions"]) @ self.weights
-        return odometry(relative, np.broadcast_to(self.covariance, (len(relative), 3, 3)))
-
-
-def _action_inputs(actions: np.ndarray) -> np.ndarray:
-    history = action_histories(actions)
-    one_hot = torch.nn.functional.one_hot(history + 1, 4)[..., 1:]
-    return np.column_stack((one_hot.flatten(1).double().numpy(), np.ones(len(actions))))
-
-
-def _windows(errors: np.ndarray) -> np.ndarray:
-    """Sums of errors ``(steps, 3)`` over each ``WINDOW`` steps that follow each other."""
-    sums = np.cumsum(np.concatenate((np.zeros((1, 3)), errors)), axis=0)
-    return np.asarray(sums[WINDOW:] - sums[:-WINDOW])
 
 
 def odometry(relative: np.ndarray, covariances: np.ndarray) -> Estimate:
