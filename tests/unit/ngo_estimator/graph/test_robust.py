@@ -118,7 +118,7 @@ def test_wrong_loops_are_recognised(group: int, metric: bool) -> None:
 def test_two_floors_that_look_alike_are_not_laid_upon_each_other(seed: int) -> None:
     """Four rounds on each: wrong loops join the same places of both, are more than the right ones, and all agree.
 
-    To believe them costs less, but overturns much of what is believed.
+    To believe them costs less, but the chain alone says that the floors are apart.
     """
     rng, wrong, right, std = np.random.default_rng(seed), 300, 200, 3.0 * STEP_STD
     floor = np.tile((1.0, 0.0, 0.0), (4 * ROUND, 1))

@@ -185,14 +185,15 @@ def _reconsidered(
 ) -> CorrectedGraph:
     """The solution after its refused loops that agree with each other were asked again, while that lowers the cost.
 
-    Where a stretch of the graph lies wrongly, the right loops that lead there are refused, and say the same of it. What
-    is believed elsewhere stays: loops that overturn most of it are wrong in one way, as between floors that look alike.
+    Where a stretch of the graph lies wrongly, the right loops that lead there are refused, and say the same of it.
+    Wrong ones may agree, too, as between floors that look alike: loops that the chain alone rules out are not asked.
     """
     scaled = problem.scaled(solution.scale)
     chain, loops = ChainUncertainty(scaled.steps), scaled.loops
+    possible = (loops.degrees == 3) & (chain.off_chain(loops)[0] <= thresholds(loops))
     for _ in range(_MOST_ROUNDS):
         poses, believed = solution.poses, solution.loop_weights > 0.0
-        again = np.flatnonzero(~believed & (loops.degrees == 3))
+        again = np.flatnonzero(~believed & possible)
         if len(again) > _MANY * believed.sum():
             again = again[agreement(chain.bent(poses), loops[again], map_area(poses)) > _AGREED]
         if len(again) <= _MANY * believed.sum():
@@ -200,8 +201,7 @@ def _reconsidered(
         asked, structure = _affordable(replace(scaled, poses=poses), np.append(np.flatnonzero(believed), again))
         poses = graduate(asked, poses, report=report, structure=structure)[0]
         other = _polished(problem, poses, solution.scale, solution.loops_from_nothing, least_scale)
-        kept = believed & (other.loop_weights > 0.0)
-        if other.cost >= solution.cost or kept.sum() < _AGREE * believed.sum():
+        if other.cost >= solution.cost:
             break
         much, solution = other.cost < _LESS * solution.cost, other
         if not much:
