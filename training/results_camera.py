@@ -28,12 +28,11 @@ from ngo_estimator.slam import picture_trajectory
 from ngo_sim import episodes, maze3d
 from training.common import records
 from training.common.command_line import check_at_least, run_command
-from training.data import room_drives
 from training.data.doom_drives import TEST_MAPS, VALIDATION_MAPS
-from training.data.room_drives import room_drive
 from training.report.folders import with_earlier
-from training.scoring import camera_rows
+from training.scoring import camera_rows, room_drives
 from training.scoring.camera_rows import Ablation, camera_drive, measured
+from training.scoring.room_drives import room_drive
 from training.scoring.table import Drive, Numbers, Row, Rows, interval_of, measure
 
 _MAPS = {"validation": VALIDATION_MAPS, "test": TEST_MAPS}
