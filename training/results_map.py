@@ -1,11 +1,10 @@
-"""How good the maps are: in unseen mazes beside the true map, on real logs by how crisp they are.
+"""How good the maps are, in unseen mazes beside the true map.
 
-    python -m training.results_map --logs FOLDER
+    python -m training.results --world map
 
-Maps are drawn at the poses of the odometry, at corrected and at true poses. In mazes, free and occupied cells are
-compared with all cells that exact rays from the true poses see. On logs the mean entropy of the known cells and the
-occupied cells a metre of the way are given, where a log has reference poses at these also.
-The command writes ``training/results/map.json`` and ``docs/results_map.md``.
+Maps are drawn at the poses of the odometry, at corrected and at true poses. Free and occupied cells are compared with
+all cells that exact rays from the true poses see. The command writes ``training/results/map.json`` and
+``docs/results_map.md``.
 """
 
 import json
@@ -19,38 +18,28 @@ import numpy as np
 import torch
 
 from ngo_estimator.checkpoint import load_local, load_optimizer, load_place
-from ngo_estimator.data.relative_step import RelativeStep
-from ngo_estimator.frontend.lidar import mixture_lidar
 from ngo_estimator.geometry import se2
 from ngo_estimator.mapping import scan_map
 from ngo_estimator.mapping import scan_source as scan_sources
 from ngo_estimator.mapping.occupancy_grid import OccupancyMap
 from ngo_estimator.mapping.scan_map import ScanMap, ScanMapConfig
-from ngo_estimator.mapping.scan_source import KeyScans, ScanSource, scan_source
+from ngo_estimator.mapping.scan_source import ScanSource, scan_source
 from ngo_estimator.ngo import whole_trajectory
 from ngo_estimator.ngo.neural_graph_optimizer import NeuralGraphOptimizer
 from ngo_estimator.ngo.whole_trajectory import optimize_offline
-from ngo_estimator.slam import scan_trajectory
 from training.common.command_line import check_at_least, run_command
 from training.data.batches import seen_from_first
 from training.data.episodes import GROUP, simulate
 from training.data.features import OPTIMIZER_INPUTS, Networks, features_of
-from training.data.lidar_drives import ReferencePoses
 from training.data.worlds import TEST_SEEDS, VALIDATION_SEEDS, World, world_named
-from training.recordings import lidar_logs
-from training.recordings.lidar_logs import log_identity, logs_below, read_drive
 from training.report import map_page
 from training.report.folders import Folders
 from training.scoring import map_errors
-from training.scoring.lidar_rows import DriveRuns, Pipeline
-from training.scoring.lidar_scores import with_runs
-from training.scoring.map_errors import intersections, mean_entropy_bits, true_map
-from training.scoring.metrics import path_length_m
+from training.scoring.map_errors import intersections, true_map
 from training.scoring.online_estimate import steps_of, with_origin
 from training.scoring.table import Drive, Measured, Row, column, folder_digest, intervals, measure, samples
 
 _CODE = (map_errors, whole_trajectory, scan_map, scan_sources)
-_LOG_CODE = (map_errors, scan_map, scan_sources, mixture_lidar, scan_trajectory)
 _SPLITS = {"validation": VALIDATION_SEEDS, "test": TEST_SEEDS}
 _ROWS = ("odometry", "corrected", "true")
 _CONFIG = ScanMapConfig(most_waiting=10**9)
@@ -66,7 +55,6 @@ class Arguments(Folders):
     """Mazes to measure in. Settings are chosen on validation; the test split is for the final table alone."""
     mazes: int = 20  # Mazes of each world, each with a trajectory of its own.
     frames: int = 500  # Frames of a trajectory.
-    logs: Path | None = None  # Folder of real logs (.bag, .log, .clf, gzipped or not); none: left out.
 
     def __post_init__(self) -> None:
         check_at_least(self, mazes=2, frames=2)
@@ -74,17 +62,14 @@ class Arguments(Folders):
 
 def main(arguments: Arguments) -> dict[str, Any]:
     """Measure, write everything, and return the JSON's content."""
-    skipped: list[str] = []
     result = {
         **arguments.made("map"),
         "split": arguments.split,
         "mazes": arguments.mazes,
         "frames": arguments.frames,
         "tables": {world: maze_table(arguments, world_named(world)) for world in arguments.worlds},
-        "logs": log_table(arguments, skipped),
-        "skipped": skipped,
     }
-    print(json.dumps({"tables": result["tables"], "skipped": skipped}))
+    print(json.dumps(result["tables"]))
     return arguments.publish("map", result, map_page.page(result))
 
 
@@ -103,7 +88,7 @@ def maze_table(arguments: Arguments, world: World) -> dict[str, Any]:
     made = Mazes.load(arguments, world)
     # Mazes of a group are simulated together: all are of the size that is drawn for the first.
     groups = [tuple(seeds[first : first + GROUP]) for first in range(0, len(seeds), GROUP)]
-    identity = _identity(made.folder)
+    identity = json.dumps([folder_digest(made.folder), repr(_CONFIG)])
     rows = {row: Row(partial(maze_errors, row=row, mazes=made), identity, _CODE) for row in _ROWS}
     drives = [
         Drive(f"mazes_{group[0]}_{len(group)}", f"{group}, {arguments.frames} frames", partial(made.drives, group))
@@ -176,56 +161,6 @@ def maze_errors(drives: list[MazeDrive], row: str, mazes: Mazes) -> Measured:
         found.append(intersections(cells.trinary(*_THRESHOLDS), one.true))
     free, occupied = np.array(found).T
     return Measured({"free_iou": free, "occupied_iou": occupied})
-
-
-def _identity(weights: Path) -> str:
-    return json.dumps([folder_digest(weights), repr(_CONFIG)])
-
-
-def log_table(arguments: Arguments, skipped: list[str]) -> dict[str, Any]:
-    """By log and row: mean entropy (bit) of the known cells, and occupied cells a metre of the way."""
-    logs = {} if arguments.logs is None else logs_below(arguments.logs)
-    if not logs:
-        skipped.append("logs: no folder is given (--logs), or it has none")
-    weights = arguments.weights / "scan"
-    identity = _identity(weights)
-    rows = {
-        row: Row(partial(log_errors, row=row), identity, _LOG_CODE) for row in ("odometry", "corrected", "reference")
-    }
-    drives = [Drive(name, log_identity(path), partial(read_drive, path), (lidar_logs,)) for name, path in logs.items()]
-    plan = [(with_runs(drive, weights), rows) for drive in drives]
-    found = measure(plan, arguments.runs / "scan" / "map", "logs")
-    skipped += [f"{name}: {log['corrected'].failed}" for name, log in found.items() if log["corrected"].failed]
-    return {
-        name: {
-            row: {key: float(value[0]) for key, value in one.errors.items()} for row, one in log.items() if one.errors
-        }
-        for name, log in found.items()
-        if not log["corrected"].failed
-    }
-
-
-def log_errors(runs: DriveRuns, row: str) -> Measured:
-    """How crisp the map of a log is at the poses of a row; nothing for a reference that does not know each pose."""
-    try:
-        run = runs.run(Pipeline())
-    except ValueError as error:
-        return Measured(failed=str(error))
-    trajectory = run.trajectory
-    poses = trajectory.odometry_xyyaw if row == "odometry" else trajectory.poses_xyyaw
-    if row == "reference":
-        reference, stamps = runs.drive.reference, trajectory.stamps_ns.tolist()
-        if not isinstance(reference, ReferencePoses):
-            return Measured()
-        known = dict(zip(reference.stamps_ns.tolist(), reference.poses_xyyaw, strict=True))
-        if not all(stamp in known for stamp in stamps):
-            return Measured()
-        poses = np.array([known[stamp] for stamp in stamps])
-    steps: list[RelativeStep] = list(run.front.steps)
-    cells = drawn(KeyScans(), steps, trajectory.stamps_ns, poses)
-    occupied = int((cells.trinary(*_THRESHOLDS).values == 100).sum())
-    way_m = path_length_m(trajectory.poses_xyyaw)
-    return Measured.of({"entropy_bits": mean_entropy_bits(cells), "occupied_cells_a_metre": occupied / way_m})
 
 
 if __name__ == "__main__":

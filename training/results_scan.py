@@ -71,7 +71,7 @@ class Arguments(Folders):
     first_building: int = 0
     """Number of the first one among the test seeds: others than those of the tables that are published."""
     length_m: float = 500.0  # Way that the robot drives in a building.
-    ablation: int = 5  # How many of these get the rows of the ablation; and how many buildings have slipping wheels.
+    ablation: int = 5  # How many of these get the rows with wrong loops; and how many buildings have slipping wheels.
     mazes: int = 8  # Mazes.
     frames: int = 2000  # Scans in a maze.
     rows: tuple[str, ...] = ()  # Rows to measure, by name; none: all. Tables that are measured hold these alone.

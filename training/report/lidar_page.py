@@ -16,7 +16,6 @@ _TITLES = {
     "kiss_icp": "KISS-ICP, z = 0",
     "icp_slam": "MRPT `icp-slam`",
     "rbpf_slam": "MRPT `rbpf-slam`",
-    "without_agreement": "ours, loops need no neighbours that agree",
     "cartographer_published": "Cartographer, as published (Hess et al. 2016), not run here",
 }
 
@@ -25,14 +24,15 @@ def page(result: Mapping[str, Any], images: Mapping[str, str]) -> str:
     """The page's text; ``images`` are the names of files in ``images/`` with their captions."""
     settings, logs = result["settings"], result["logs"]
     with_relations = {name: rows for name, rows in logs.items() if "translation_m" in rows.get("ours", {})}
-    with_mapper = {name: _of_rows(rows, ablation=False) for name, rows in logs.items() if name not in with_relations}
+    with_mapper = {name: _unfed(rows) for name, rows in logs.items() if name not in with_relations}
     parts = [
         "<!-- Made by `python -m training.results --world scan`; changes belong into report/lidar_page.py. -->",
         "# Results of the lidar",
         f"`{result['command']}` at revision `{result['revision']}`. In brackets are 95 % bootstrap intervals: over the "
         "relations of a log, over the drives of a table. A number of one whole log has none. Odometry is what the "
-        "correction was given: our front end's. Online is each pose as it was published. Speed is by computing time on "
-        "one thread. Numbers in full are in [`training/results/scan.json`](../training/results/scan.json).",
+        "correction was given: our front end's. Online is each pose as it was published. The negative log-likelihood "
+        "of the truth (nats a pose) is lower for a covariance that fits better. Speed is by computing time on one "
+        "thread. Numbers in full are in [`training/results/scan.json`](../training/results/scan.json).",
         *_earlier(result["earlier"]),
     ]
     if with_relations:
@@ -42,7 +42,7 @@ def page(result: Mapping[str, Any], images: Mapping[str, str]) -> str:
             "30 s: there loops show.",
         ]
         for name, rows in with_relations.items():
-            parts += [f"### {name}", _table(_of_rows(rows, ablation=False), _RELATION_COLUMNS)]
+            parts += [f"### {name}", _table(_unfed(rows), _RELATION_COLUMNS)]
     if with_mapper:
         parts += [
             "## Logs with a mapper's poses",
@@ -57,10 +57,10 @@ def page(result: Mapping[str, Any], images: Mapping[str, str]) -> str:
             f"## {title}",
             f"Up to {settings['buildings']} buildings that nothing was trained or chosen on, {settings['length_m']:g} "
             "m each or 20,000 scans, with drawn scanners and wheels. Rows of fewer drives have some of them.",
-            _table(_of_rows(result["tables"][name], ablation=False), _BUILDING_COLUMNS),
-            _against_ours(_of_rows(result["paired"][name], ablation=False)),
+            _table(_unfed(result["tables"][name]), _BUILDING_COLUMNS),
+            _against_ours(_unfed(result["paired"][name])),
         ]
-    parts += _ablation(result)
+    parts += _changed(result)
     parts += [
         "## Mazes",
         f"Up to {settings['mazes']} validation mazes of `maze2d`, {settings['frames']} scans each, no wheels.",
@@ -78,31 +78,11 @@ def _earlier(tables: Mapping[str, Any]) -> list[str]:
     return [f"**Not measured anew, and so of an earlier revision: {', '.join(names)}.**"] if names else []
 
 
-def _ablation(result: Mapping[str, Any]) -> list[str]:
-    parts = [
-        "## Ablation",
-        f"The first {result['settings']['ablation']} drives of each table. The negative log-likelihood of the "
-        "truth (nats a pose) is lower for a covariance that fits better. Differences are to the "
-        "row that is named, on the same drives, with 95 % bootstrap intervals over the drives.",
-    ]
-    for name, title in _BUILDING_TITLES.items():
-        rows = {row: numbers for row, numbers in _of_rows(result["tables"][name], True).items() if row not in _FED}
-        if rows:
-            parts += [
-                f"### {title}",
-                _table(rows, _BUILDING_COLUMNS),
-                _differences(_of_rows(result["paired"][name], True)),
-            ]
-    logs = {
-        log: {row: numbers for row, numbers in rows.items() if row == "ours" or (row in ROWS and ROWS[row].ablation)}
-        for log, rows in result["logs"].items()
-    }
-    unfed = {log: {row: numbers for row, numbers in rows.items() if row not in _FED} for log, rows in logs.items()}
-    if any(len(rows) > 1 for rows in unfed.values()):
-        parts += ["### Logs", "ATE, or mean translational error of relations, m.", _across(unfed, *_ERRORS)]
+def _changed(result: Mapping[str, Any]) -> list[str]:
+    parts, drives = list[str](), f"The first {result['settings']['ablation']} drives of each table"
     if slip := result["tables"]["slip"]:
         parts += [
-            "### Wheels that slip",
+            "## Wheels that slip",
             "The first buildings again, but the wheels slip 300 times a km, each time for 0.3 to 1.5 s by up to 60 %.",
             _table(slip, _BUILDING_COLUMNS),
         ]
@@ -110,10 +90,10 @@ def _ablation(result: Mapping[str, Any]) -> list[str]:
     fed = {name: rows for name, rows in tables.items() if any(row in _FED for row in rows)}
     if fed:
         parts += [
-            "### Wrong loops fed in",
-            "Errors (m: ATE; of a log with relations the mean of these) where so many of all loops are wrong, all at "
-            "once, from odometry. A wrong loop is a right one that took another place; five in a row agree with each "
-            "other. Each number is the mean over three draws.",
+            "## Wrong loops fed in",
+            f"{drives}, and all logs. Errors (m: ATE; of a log with relations the mean of these) where so many of all "
+            "loops are wrong, all at once, from odometry. A wrong loop is a right one that took another place; five in "
+            "a row agree with each other. Each number is the mean over three draws.",
             _across({name: {row: rows[row] for row in _FED if row in rows} for name, rows in fed.items()}, *_ERRORS),
         ]
     return parts
@@ -124,8 +104,8 @@ _FED = [row for row in ROWS if row.endswith("percent_wrong")]
 _ERRORS = ("ate_m", "translation_m")
 
 
-def _of_rows(rows: Mapping[str, Any], ablation: bool) -> dict[str, Any]:
-    return {name: numbers for name, numbers in rows.items() if (name in ROWS and ROWS[name].ablation) == ablation}
+def _unfed(rows: Mapping[str, Any]) -> dict[str, Any]:
+    return {name: numbers for name, numbers in rows.items() if name not in _FED}
 
 
 _RELATION_COLUMNS = {
@@ -194,24 +174,6 @@ def _against_ours(paired: Mapping[str, Any]) -> str:
         if "ate_m" in numbers
     ]
     return markdown(["ATE against ours, same drives", "%"], body)
-
-
-def _differences(paired: Mapping[str, Any]) -> str:
-    keys = {
-        "ate_m": "ATE, m",
-        "within_three_deviations": "truth within 3 deviations",
-        "negative_log_likelihood": "negative log-likelihood",
-    }
-    body = [
-        [
-            _title(row),
-            _title(numbers["with"]),
-            *(with_interval(numbers[key]["difference"], signed(4)) if key in numbers else "" for key in keys),
-        ]
-        for row, numbers in paired.items()
-        if row not in _FED
-    ]
-    return markdown(["difference of", "to", *keys.values()], body)
 
 
 def _cell(numbers: Mapping[str, Any], key: str) -> str:

@@ -15,9 +15,6 @@ Intersection over union of the map's cells with all cells that exact rays from t
 cells, and cells that a wall's surface crosses. {mazes} mazes a world, of the {split}
 split, {frames} frames each, cells of 0.05 m, all poses seen from the first one."""
 
-_LOGS = """Real logs of a lidar. Scans that contradict each other raise the entropy, and blur walls into more cells.
-`reference`: the poses of the mapper that wrote the log."""
-
 
 def page(result: dict[str, Any]) -> str:
     """The page of a JSON's content."""
@@ -27,13 +24,4 @@ def page(result: dict[str, Any]) -> str:
         for world, rows in result["tables"].items()
         for row, numbers in rows.items()
     )
-    parts = [_INTRODUCTION.format(**result), markdown(header, mazes)]
-    if result["logs"]:
-        header = ["Log", "Poses", "Mean entropy of known cells, bit", "Occupied cells a metre of the way"]
-        rows = (
-            [f"`{log}`", row, f"{entry['entropy_bits']:.4f}", f"{entry['occupied_cells_a_metre']:.1f}"]
-            for log, rows in result["logs"].items()
-            for row, entry in rows.items()
-        )
-        parts += [_LOGS, markdown(header, rows)]
-    return whole(parts)
+    return whole([_INTRODUCTION.format(**result), markdown(header, mazes)])

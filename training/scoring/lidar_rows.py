@@ -280,7 +280,6 @@ ROWS: dict[str, Row] = {
     "gtsam_lm": _gtsam(graph_peers.cauchy_on_all),
     "gtsam_gnc": _gtsam(graph_peers.gnc),
     "kiss_icp": Row(partial(kiss, config=KissConfig()), KissConfig(), code=(lidar_peers,), missing=_kiss_missing),
-    "without_agreement": _ours(True, graph={"loops.least_agreeing": 0, "loops.agreeing_per_deviation": 0.0}),
     **{
         f"{name}_{percent}_percent_wrong": _fed(name, solve, percent)
         for percent in (10, 30, 60)

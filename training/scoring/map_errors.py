@@ -1,4 +1,4 @@
-"""How much of a map is right: its free and occupied cells beside those of the true maze; and how crisp a map is."""
+"""How much of a map is right: its free and occupied cells beside those of the true maze."""
 
 from __future__ import annotations
 
@@ -54,12 +54,6 @@ def intersections(found: OccupancyMap, true: OccupancyMap) -> tuple[float, float
         for value in (_FREE, _OCCUPIED)
     )
     return float(free), float(occupied)
-
-
-def mean_entropy_bits(found: OccupancyMap) -> float:
-    """Mean entropy of the cells that anything is known of: a map whose scans contradict each other has more."""
-    share = np.clip(found.values[found.values != _UNKNOWN] / 100.0, 0.005, 0.995)
-    return float(-(share * np.log2(share) + (1.0 - share) * np.log2(1.0 - share)).mean())
 
 
 def _is_wall(maze: Maze, first: np.ndarray, points: np.ndarray) -> np.ndarray:

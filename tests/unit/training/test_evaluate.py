@@ -10,7 +10,7 @@ from ngo_estimator.ngo.whole_trajectory import optimize_offline
 from ngo_estimator.slam.online_trajectory import OnlineTrajectory
 from ngo_sim.mazes import Maze
 from tests.unit.ngo_estimator.samples import small_optimizer, small_pair_head, trajectory_inputs
-from training.scoring.map_errors import intersections, mean_entropy_bits, true_map
+from training.scoring.map_errors import intersections, true_map
 from training.scoring.online_estimate import online_poses
 
 NAMES = ("relative", "log_std", "motion", "codes")
@@ -62,8 +62,3 @@ def test_the_true_map_is_what_can_be_seen_in_the_frame_of_the_first_pose() -> No
     walls = true.origin_xy + 0.1 * (np.column_stack((columns, rows)) + 0.5)
     beside = walls[np.abs(walls[:, 1]) < 0.3]
     assert np.abs(np.abs(beside[:, 0]) - 0.5).max() < 0.06
-
-
-def test_a_coin_has_one_bit() -> None:
-    assert mean_entropy_bits(a_map([[-1, 50, 50]])) == pytest.approx(1.0)
-    assert mean_entropy_bits(a_map([[-1, 0, 100]])) == pytest.approx(0.0454, abs=1e-4)
