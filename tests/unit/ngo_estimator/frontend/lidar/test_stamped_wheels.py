@@ -57,3 +57,17 @@ def test_the_lag_is_learned_from_turns() -> None:
             at_s = 0.02 * k
             wheels.observe_turn(at_s - 0.2, at_s, float(yaw(at_s - 0.1) - yaw(at_s - 0.3)))
     assert wheels.lag_s == pytest.approx(0.1, abs=0.01)
+
+
+@pytest.mark.parametrize("apart_ms", [0, 30])
+def test_noise_of_the_wheels_makes_no_lag(apart_ms: int) -> None:
+    """Between two readings their noise averages out; a lag of half a period must seem no better for it."""
+    noise, wheels = np.random.default_rng(apart_ms), StampedWheels()
+    yaw = lambda at_s: 0.8 * np.sin(1.3 * at_s)  # noqa: E731
+    drift = np.cumsum(noise.normal(0.0, 0.03, 1000))
+    for k in range(1000):
+        at_s = 0.1 * k + 1e-3 * apart_ms
+        wheels.add(round(at_s * 1e9), np.array((0.0, 0.0, yaw(at_s) + drift[k])))
+        if k > 10:
+            wheels.observe_turn(0.1 * k - 0.1, 0.1 * k, float(yaw(0.1 * k) - yaw(0.1 * k - 0.1)))
+    assert wheels.lag_s == 0.0

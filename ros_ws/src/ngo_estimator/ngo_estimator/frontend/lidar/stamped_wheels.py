@@ -141,12 +141,29 @@ def _pose_at(rows: Array, at: float) -> Array:
 
 @njit(cache=True)
 def _turns(rows: Array, start_s: float, end_s: float) -> Array:
-    """How far the wheels turned between two times, at each lag."""
-    first = np.searchsorted(rows[:, 0], start_s - _LAGS_S[-1]) - 1
-    last = np.searchsorted(rows[:, 0], end_s - _LAGS_S[0]) + 1
+    """How far the wheels turned between two times, at each lag.
+
+    A cubic B-spline has nearly the same noise at and between readings. Straight lines have less between them, so that
+    noise alone would make a lag of half a period.
+    """
+    first = np.searchsorted(rows[:, 0], start_s - _LAGS_S[-1]) - 2
+    last = np.searchsorted(rows[:, 0], end_s - _LAGS_S[0]) + 2
     near = rows[max(first, 0) : last]
     times, yaws = near[:, 0].copy(), near[:, 3].copy()
-    result: Array = np.interp(end_s - _LAGS_S, times, yaws) - np.interp(start_s - _LAGS_S, times, yaws)
+    result: Array = _smooth(times, yaws, end_s - _LAGS_S) - _smooth(times, yaws, start_s - _LAGS_S)
+    return result
+
+
+@njit(cache=True)
+def _smooth(times: Array, values: Array, at: Array) -> Array:
+    """A cubic B-spline of ``values`` ``(n,)`` at some times ``(k,)``."""
+    places = np.interp(at, times, np.arange(len(times)).astype(np.float64))
+    result = np.empty(len(at))
+    for k in range(len(at)):
+        i = min(int(places[k]), len(values) - 2)
+        s = places[k] - i
+        weights = (1.0 - s) ** 3, 3.0 * s**3 - 6.0 * s**2 + 4.0, 3.0 * s * (1.0 + s - s**2) + 1.0, s**3
+        result[k] = sum([weights[j] / 6.0 * values[min(max(i + j - 1, 0), len(values) - 1)] for j in range(4)])
     return result
 
 
