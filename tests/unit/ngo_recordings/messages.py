@@ -63,7 +63,7 @@ def cloud(
     big: bool = False,
 ) -> Any:
     """A PointCloud2 whose fields ``(points,)`` lie one after the other, with ``padding`` bytes behind each point."""
-    codes = {"f4": 7, "f8": 8, "u2": 4, "u4": 6}
+    codes = {"i2": 3, "f4": 7, "f8": 8, "u2": 4, "u4": 6}
     order = ">" if big else "<"
     kind = np.dtype([(name, order + values.dtype.str[1:]) for name, values in fields.items()] + [("", f"V{padding}")])
     points = np.zeros(len(fields["x"]), kind)

@@ -298,6 +298,15 @@ def test_of_a_mounting_that_changes_the_one_that_holds_longest_counts(tmp_path: 
     assert found.base_from_scan_xyyaw[0] == pytest.approx(0.3) and "it changes on the way" in str(found)
 
 
+def test_two_robots_whose_frames_have_the_same_names_are_told(tmp_path: Path) -> None:
+    entries = [*drive(10), *(("/other/scan", stamp(k + 0.5), scan(stamp(k + 0.5))) for k in range(10))]
+    for at, x in ((1, 0.3), (2, 0.9)):
+        entries.append(("/tf_static", at, m.transforms(static("base_link", "laser", x, 0.0, 0.0))))
+    with open_recording([m.write_mcap(tmp_path / "a.mcap", sorted(entries, key=lambda entry: entry[1]))]) as recording:
+        notes = describe_lidar(recording, choose_topics(recording)).notes
+    assert [note for note in notes if "robots with the same frames cannot be told apart" in note]
+
+
 def test_time_without_scans_speaks_for_no_mounting(tmp_path: Path) -> None:
     found = mounting_of_drives(tmp_path, (0, 20, {1: 5.0, stamp(-10): 0.3}))
     assert found.base_from_scan_xyyaw[0] == pytest.approx(0.3)

@@ -127,6 +127,36 @@ def test_depth_is_a_scan_ahead_as_far_as_depth_is_exact(encoding: str) -> None:
     assert np.abs(made.angles[seen]).max() == pytest.approx(math.radians(45.0), abs=0.01) and seen.sum() > 120
 
 
+def test_depth_as_numbers_in_millimetres_is_taken_so() -> None:
+    image, info = depth_image("32FC1")
+    image.data = (1000.0 * image.data.view("f4")).view(np.uint8)
+    assert off_walls(depth_scan(image, info, "/depth")).max() < 0.03
+
+
+@pytest.mark.parametrize("change", ["full", "binned", "part", "no size", "projection"])
+def test_a_camera_is_described_whatever_its_images_show_of_it(change: str) -> None:
+    """Full pictures of the sensor are twice as large, a part of it lacks a border, and drivers forget half."""
+    image, info = depth_image("16UC1")
+    if change in ("full", "binned"):
+        info.width, info.height = 320, 240
+        info.k = np.array((160.0, 0.0, 159.5, 0.0, 160.0, 119.5, 0.0, 0.0, 1.0))
+        info.binning_x = info.binning_y = 2 if change == "binned" else 0
+    elif change == "part":
+        info.width, info.height, info.k = 200, 140, info.k + (0.0, 0.0, 30.0, 0.0, 0.0, 10.0, 0.0, 0.0, 0.0)
+        info.roi = m.make("sensor_msgs/msg/RegionOfInterest", 30, 10, 120, 160, False)
+    elif change == "no size":
+        info.width = info.height = 0
+    else:
+        info.p, info.k = np.insert(info.k, (3, 6, 9), 0.0), np.zeros(9)
+    np.testing.assert_allclose(depth_scan(image, info, "/d").ranges, depth_scan(*depth_image("16UC1"), "/d").ranges)
+
+
+@pytest.mark.parametrize("kind", ["i2", "f4"])
+def test_clouds_in_millimetres_are_taken_so(kind: str) -> None:
+    made = cloud_scan(m.cloud(BEGIN_NS, fields(1000.0 * turning()[0], kind)), "/points")
+    assert np.isfinite(made.ranges).sum() > 1300 and off_walls(made).max() < 0.02
+
+
 def test_a_camera_without_its_description_is_named() -> None:
     image, info = depth_image("16UC1")
     with pytest.raises(RecordingError, match="no CameraInfo came on /camera/camera_info"):

@@ -91,7 +91,7 @@ def _first_scans(recording: Recording, topic: str) -> tuple[LidarScan, ScanAngle
     return first, angles, stamps, damaged
 
 
-def _others(recording: Recording, topics: RecordingTopics) -> list[str]:
+def _others(recording: Recording, topics: RecordingTopics, mounting: Mounting | None) -> list[str]:
     """A sentence on other scans, and one on other odometries, each with its rate."""
     kinds = (SCAN_TYPE, CLOUD_TYPE)
     scans = [name for name, info in recording.topics.items() if info.type_name in kinds and info.count]
@@ -101,11 +101,20 @@ def _others(recording: Recording, topics: RecordingTopics) -> list[str]:
         others = ", ".join(_with_rate(recording, name) for name in more)
         used = ", ".join(topics.scans)
         notes.append(f"scans of {used} are used; others are {others}: --image names another one, --scan-topics several")
+        if mounting is not None and mounting.changes and mounting.scan_frame in (_frame(recording, each) for each in more):
+            notes.append(
+                f"two scanners have the frame {mounting.scan_frame}, and it has two places: robots with the same frames "
+                "cannot be told apart, give each a prefix"
+            )
     if len(wheels) > 1:
         taken = "no odometry" if topics.wheels is None else str(topics.wheels)
         there = ", ".join(_with_rate(recording, name) for name in wheels)
         notes.append(f"{taken} is used of {there}: --wheels names another one")
     return notes
+
+
+def _frame(recording: Recording, name: str) -> str:
+    return str(recording.first(name).value.header.frame_id).strip("/")
 
 
 def _with_rate(recording: Recording, name: str) -> str:
@@ -128,7 +137,8 @@ def describe_lidar(recording: Recording, topics: RecordingTopics) -> LidarDescri
     if damaged:
         looked = max(_LOOK, damaged + len(stamps))
         notes.append(f"{damaged} of the first {looked} scans of {topics.image} are damaged and left out")
-    notes += _others(recording, topics)
+    mounting = find_mounting(recording, topics)
+    notes += _others(recording, topics, mounting)
     if recording.stamps_made:
         kind = "made from the order of messages"
     elif len(stamps) > 1 and not steps.any():
@@ -147,7 +157,7 @@ def describe_lidar(recording: Recording, topics: RecordingTopics) -> LidarDescri
         field_of_view=abs(angles.angle_increment) * (len(first.ranges) - 1),
         range_max=first.range_max,
         rate_hz=rate,
-        mounting=find_mounting(recording, topics),
+        mounting=mounting,
         wheels=wheels,
         wheel_poses=recording.topics[wheels.topic].count if wheels is not None and wheels.topic is not None else 0,
         stamps=kind,

@@ -27,6 +27,8 @@ _LOOK_NS = 600_000_000_000
 
 _OPTICAL_FROM_BODY = Pose(np.zeros(3), Rotation.from_matrix([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]]))
 
+_CHANGES = "it changes on the way"
+
 _NEAR_M, _NEAR_RAD = 0.01, math.radians(0.5)
 """Mountings that differ by less are the same."""
 
@@ -60,6 +62,11 @@ class Mounting:
         off = self.base_from_scan_xyyaw - other.base_from_scan_xyyaw
         turn = abs(math.remainder(float(off[2]), math.tau))
         return self.upside_down == other.upside_down and math.hypot(off[0], off[1]) < _NEAR_M and turn < _NEAR_RAD
+
+    @property
+    def changes(self) -> bool:
+        """Whether the transforms say another one, too."""
+        return self.source.endswith(_CHANGES)
 
     def __str__(self) -> str:
         x, y, yaw = self.base_from_scan_xyyaw.tolist()
@@ -116,7 +123,7 @@ def find_pose(
     if found is not None:
         source += ", whose transforms go round" if tree.parent(tree.root(scan_frame)) else ""
         if changed & set(tree.between(found[0], scan_frame)):
-            source += ", as it was said for the longest time: it changes on the way"
+            source += f", as it was said for the longest time: {_CHANGES}"
         return found[0], scan_frame, found[1], source
     moving = [name for name in names if name not in static]
     start_ns: int | None = None

@@ -34,6 +34,11 @@ _FARTHEST_DEPTH_M = 5.0
 _SANE_M, _MOSTLY = (1e-5, 1e5), 0.8
 """Coordinates are within these, mostly; else the driver says the wrong order of bytes, which PCL does not read."""
 
+_FAR = 100.0
+"""No sensor of a robot sees half of its points so far away (m)."""
+_SAME_VIEW = 0.03
+"""Widths and heights of two images of one view have the same ratio, but for pixels that were rounded off."""
+
 _TIMES = ("time", "t", "timestamp", "time_stamp", "offset_time", "time_offset", "ts")
 _UNITS = (1.0, 1e-3, 1e-6, 1e-9)
 _LONGEST_S = 1.0
@@ -59,7 +64,7 @@ def cloud_scan(message: Any, topic: str) -> LidarScan:
         values = swapped if _sane(swapped["x"]) > _MOSTLY > 2.0 * sane else values
     if not {"x", "y", "z"} <= set(names):
         raise RecordingError(f"a cloud of {topic} has the fields {', '.join(names) or 'none'}; expected x, y and z")
-    points = np.stack([values[name].astype(np.float64) for name in "xyz"], axis=-1)
+    points = _metres(np.stack([values[name].astype(np.float64) for name in "xyz"], axis=-1))
     frame = str(message.header.frame_id).strip("/")
     if is_optical(frame):
         points = points[:, (2, 0, 1)] * (1.0, -1.0, -1.0)
@@ -78,17 +83,18 @@ def depth_scan(message: Any, info: Any, topic: str) -> LidarScan:
     if info is None:
         raise RecordingError(f"no CameraInfo came on {info_topic(topic)}, which says how {topic} was taken")
     depth, _ = picture(message, IMAGE_TYPE, topic)
-    matrix = camera_matrix(info)
     if depth.dtype != np.float32 or depth.shape[2] != 1:
         raise RecordingError(f"images of {topic} are {message.encoding!r}; expected depth, 16UC1 or 32FC1")
     height, width = depth.shape[:2]
-    if not matrix.size or (info.height, info.width) != (height, width):
-        focal = f"{matrix[0]:g} pixels" if matrix.size else "not known"
+    matrix = _matrix_of(info, width, height)
+    if matrix is None:
+        known = camera_matrix(info)
+        focal = f"{known[0]:g} pixels" if known.size else "not known"
         raise RecordingError(
             f"an image of {topic} is {width} x {height}; its CameraInfo is of {info.width} x {info.height}, its focal "
             f"length {focal}"
         )
-    ahead = depth[..., 0].astype(np.float64)
+    ahead = _metres(depth[..., 0].astype(np.float64))
     ahead[~(ahead < _FARTHEST_DEPTH_M)] = np.nan
     left = (matrix[2] - np.arange(width)) / matrix[0] * ahead
     up = ((matrix[5] - np.arange(height)) / matrix[4])[:, None] * ahead
@@ -98,10 +104,32 @@ def depth_scan(message: Any, info: Any, topic: str) -> LidarScan:
 
 
 def camera_matrix(info: Any) -> np.ndarray:
-    """The camera matrix ``(9,)`` of a CameraInfo; nothing ``(0,)`` where it has none."""
-    matrix = np.asarray(getattr(info, "k", getattr(info, "K", ())), np.float64)
-    usable = matrix.size == 9 and np.isfinite(matrix).all() and matrix[0] > 0.0 and matrix[4] > 0.0
-    return matrix if usable else np.zeros(0)
+    """The camera matrix ``(9,)`` of a CameraInfo, or that of its projection; nothing ``(0,)`` where it has none."""
+    matrix, projection = (np.asarray(getattr(info, name, getattr(info, name.upper(), ())), float) for name in "kp")
+    for each in (matrix, projection.reshape(3, 4)[:, :3].ravel() if projection.size == 12 else matrix):
+        if each.size == 9 and np.isfinite(each).all() and each[0] > 0.0 and each[4] > 0.0:
+            return each
+    return np.zeros(0)
+
+
+def _matrix_of(info: Any, width: int, height: int) -> np.ndarray | None:
+    """The camera matrix ``(9,)`` of an image of this size: a part of the sensor's pixels, or fewer of the same view.
+
+    None where the CameraInfo is of another view, or of none.
+    """
+    matrix, roi = camera_matrix(info).copy(), getattr(info, "roi", None)
+    if not matrix.size:
+        return None
+    of_part = roi is not None and roi.width > 0 and roi.height > 0
+    own = info.width or 2.0 * matrix[2] + 1.0, info.height or 2.0 * matrix[5] + 1.0
+    whole = (roi.width, roi.height) if of_part else own
+    across, down = width / whole[0], height / whole[1]
+    if abs(across / down - 1.0) > _SAME_VIEW:
+        return None
+    corner = (roi.x_offset, roi.y_offset) if of_part else (0.0, 0.0)
+    matrix[[0, 4]] *= across, down
+    matrix[[2, 5]] = (matrix[[2, 5]] - corner + 0.5) * (across, down) - 0.5
+    return matrix
 
 
 def info_topic(depth_topic: str) -> str:
@@ -148,6 +176,12 @@ def _records(message: Any, topic: str) -> np.ndarray:
         raise RecordingError(f"a cloud of {topic} has the fields {', '.join(names)}; expected each name once")
     kind = np.dtype({"names": names, "formats": formats, "offsets": [f.offset for f in known], "itemsize": step})
     return np.ndarray((height, width), kind, data, 0, (row, step)).reshape(-1)
+
+
+def _metres(values: np.ndarray) -> np.ndarray:
+    """Distances or coordinates as they should be: a driver may give them in millimetres."""
+    sizes = np.abs(values[np.isfinite(values) & (values != 0.0)])
+    return 0.001 * values if sizes.size and np.median(sizes) > _FAR else values
 
 
 def _sane(values: np.ndarray) -> float:

@@ -82,6 +82,17 @@ def test_ranges_in_millimetres_are_told_and_scaled(limit_m: float, unit: float, 
     assert scanner.remarks("laser") == ["laser: its ranges are in millimetres: taken so"]
 
 
+@pytest.mark.parametrize("limits_m", [(5.0, 3000.0), (0.05, 30.0)])
+def test_ranges_in_centimetres_are_told_and_scaled(limits_m: tuple[float, float]) -> None:
+    scanner = Scanner()
+    for scan in drive(10):
+        wrong = replace(scan, ranges=np.round(100.0 * scan.ranges), range_min=limits_m[0], range_max=limits_m[1])
+        found = scanner.correct(wrong, 0.0)
+    assert found is not None and (found.range_min, found.range_max) == (0.05, 30.0)
+    np.testing.assert_allclose(found.ranges, scan.ranges, atol=0.01)
+    assert scanner.remarks("laser") == ["laser: its ranges are in centimetres: taken so"]
+
+
 @pytest.mark.parametrize("limits_m", [(100.0, 120.0), (50.0, 12_000.0), (15.0, 0.0), (0.1, 0.5)])
 def test_limits_that_contradict_all_ranges_are_told_and_not_used(limits_m: tuple[float, float]) -> None:
     scanner = Scanner()
@@ -175,8 +186,10 @@ def test_a_simulated_robot_that_stands_sees_the_same_at_its_usual_pace() -> None
 
 @pytest.mark.parametrize("direction", [1.0, -1.0])
 def test_sectors_that_carry_one_stamp_were_measured_one_after_the_other(direction: float) -> None:
+    """As many rays make a turn as do for the driver, though its increment is a short number."""
     (scan,) = drive(1)
-    scan = replace(scan, angle_min=-direction * math.pi, angle_increment=direction * scan.angle_increment)
+    increment = float(np.nextafter(np.float32(scan.angle_increment), np.float32(0.0)))
+    scan = replace(scan, angle_min=-direction * math.pi, angle_increment=direction * increment)
     mounting, third = Mounting(np.zeros(3)), RAYS // 3
     sectors = [
         replace(scan, angle_min=scan.angles[first], ranges=scan.ranges[first : first + third])

@@ -171,6 +171,16 @@ def test_wheels_are_not_to_blame_where_scans_alone_get_lost_as_well() -> None:
     assert not run.learn(made).useless
 
 
+def test_wheels_without_a_heading_are_left_out() -> None:
+    """Their ways are those of the room, not of the robot, and must measure no sweep."""
+    poses = drive(160)
+    made = records(poses, sweeps=True)
+    flat = [replace(r, pose_xyyaw=r.pose_xyyaw * (1.0, 1.0, 0.0)) if isinstance(r, WheelPose) else r for r in made]
+    off_m, run = run_over(flat, poses)
+    assert off_m == run_over([record for record in made if isinstance(record, LidarScan)], poses)[0] < 0.06
+    assert [line.partition(":")[2] for line in run.remarks()] == [" they are left out"]
+
+
 def test_wheels_that_have_nothing_to_do_with_the_scans_are_left_out() -> None:
     made, other = records(STILL), records(drive(240)[::-1].copy())
     wheels = [record for record in other if isinstance(record, WheelPose)]

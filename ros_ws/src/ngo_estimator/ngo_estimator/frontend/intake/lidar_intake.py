@@ -191,6 +191,7 @@ class LidarIntake:
             begin_ns, end_ns = step.from_stamp_ns - early_ns, step.stamp_ns - early_ns
             by_wheels = counted * self._clock.truth.turn_scale
             self._imu.observe(begin_ns, end_ns, float(step.relative_xyyaw[2]), by_wheels)
+        motion = None if self._clock.truth.useless else motion
         for name, scanner in self._scanners.items():
             if self._turns.alone and (mounting := self._mountings.get(name)) is not None:
                 scanner.sweep.observe(step.stamp_ns, step.relative_xyyaw, motion, elapsed_s, mounting)

@@ -7,7 +7,13 @@ import numpy as np
 from ngo_recordings.scan_stream import LidarScan
 
 _FAR = 150.0
-"""No scanner of a robot sees so far (m) in nearly all directions, nor so little (mm)."""
+"""No scanner of a robot sees so far (m) in a tenth of all directions, nor so little (mm) in nearly all."""
+
+_MIDDLE_CM = 1000.0
+"""No room is so wide in centimetres: half of the ranges are below."""
+
+_MOST_LIMIT_M = 500.0
+"""No scanner sees so far in metres."""
 
 _LEAST_LIMIT_M = 1.0
 """A driver's smallest range is less; a larger number is in millimetres."""
@@ -23,46 +29,49 @@ _SCANS = 3
 _SPREAD = 1.1
 """Ratio of the ranges of nearly all rays: where it is less, nothing came back, by a value that jitters."""
 
-_METRES = np.float32(0.001)
+_NAMES = {0.001: "millimetres", 0.01: "centimetres"}
 
 
 class RangeUnit:
     """Finds out, and gives scans in metres."""
 
     def __init__(self) -> None:
-        self.millimetres = False
-        """Whether ranges are in millimetres."""
+        self._unit_m = 1.0
         self._doubted = self._beyond = 0
 
     def metres(self, scan: LidarScan) -> LidarScan:
         """The scan in metres, also its limits where these are not."""
-        near, far = _nearly_all(scan.ranges)
-        doubted = 0.0 < far < _FAR if self.millimetres else near > _FAR
+        near, middle, far = _nearly_all(scan.ranges)
+        low, high = scan.range_min, scan.range_max
+        found_m = 0.001 if near > _FAR else 1.0
+        if far > _FAR >= near > 0.1 * _FAR and (low > _LEAST_LIMIT_M or high > _MOST_LIMIT_M or 0.0 < high < near):
+            found_m = 0.01 if middle < _MIDDLE_CM else 0.001
+        doubted = 0.0 < far * self._unit_m < 0.001 * _FAR if self._unit_m < 1.0 else found_m < 1.0
         self._doubted = self._doubted + 1 if doubted else 0
         if self._doubted >= _SCANS:
-            self.millimetres, self._doubted = not self.millimetres, 0
-        low, high = scan.range_min, scan.range_max
-        if not self.millimetres:
+            self._unit_m, self._doubted = 1.0 if self._unit_m < 1.0 else found_m, 0
+        if self._unit_m == 1.0:
             if self._beyond < _SCANS:
                 beyond = _LEAST_LIMIT_M < low > far > 0.0 or 0.0 < high < near < far / _SPREAD
                 self._beyond = self._beyond + 1 if beyond else 0
             return scan if self._beyond < _SCANS else replace(scan, range_min=0.0, range_max=0.0)
-        low = 0.001 * low if low > _LEAST_LIMIT_M else low
-        high = 0.001 * high if high > max(near, _FAR) else high
-        return replace(scan, ranges=scan.ranges * _METRES, range_min=low, range_max=high)
+        low = self._unit_m * low if low > _LEAST_LIMIT_M else low
+        high = self._unit_m * high if high > max(near, _FAR) else high
+        return replace(scan, ranges=scan.ranges * np.float32(self._unit_m), range_min=low, range_max=high)
 
     def remark(self) -> str:
         """In words; nothing where ranges and limits are in metres."""
-        if self.millimetres:
-            return "its ranges are in millimetres: taken so"
+        if self._unit_m < 1.0:
+            return f"its ranges are in {_NAMES[self._unit_m]}: taken so"
         return "nearly all it measures is beyond its limits: they are not used" if self._beyond >= _SCANS else ""
 
 
-def _nearly_all(ranges: np.ndarray) -> tuple[float, float]:
-    """Between which nearly all ranges lie; 0 and 0 where these are few, or alike."""
+def _nearly_all(ranges: np.ndarray) -> tuple[float, float, float]:
+    """Between which nearly all ranges lie, and the median between both; zeros where these are few, or alike."""
     seen = ranges[np.isfinite(ranges) & (ranges > 0.0)]
     if len(seen) < _FEWEST or len(np.unique(seen)) < _DISTINCT * len(seen):
-        return 0.0, 0.0
+        return 0.0, 0.0, 0.0
     least = round(_NEARLY_ALL * len(seen))
-    near, far = np.partition(seen, (least, len(seen) - 1 - least))[[least, -1 - least]]
-    return float(near), float(far)
+    order = least, len(seen) // 2, len(seen) - 1 - least
+    near, middle, far = np.partition(seen, order)[list(order)].tolist()
+    return near, middle, far

@@ -24,6 +24,8 @@ _PAUSE = 2.0
 """A pause within a turn that is so much longer than the one before it ends the turn."""
 
 _MOST_RAYS = 4096
+_ROUNDED = 0.01
+"""Rays by which an increment, a short number, may miss a whole turn."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -124,7 +126,7 @@ def together(parts: list[Part], first: Part) -> LidarScan:
     if len(parts) == 1 and parts[0].scanner == first.scanner:
         return parts[0].scan
     increment = min(abs(part.scan.angle_increment) for part in parts)
-    count = min(math.ceil(math.tau / increment - 1e-6), _MOST_RAYS)
+    count = min(math.ceil(math.tau / increment - _ROUNDED), _MOST_RAYS)
     increment = math.tau / count
     began_ns = {part.scanner: part.scan.stamp_ns for part in reversed(parts)}
     stamp_ns = max(began_ns.values())

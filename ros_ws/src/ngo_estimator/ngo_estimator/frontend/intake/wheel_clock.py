@@ -37,6 +37,9 @@ _CONTRADICTS = 0.3
 _MUCH_RAD = 6.0
 """Wheels that correlate less at any offset, while both turned so much, tell nothing."""
 
+_NO_TURN = 0.01
+"""Wheels that turned by less of what the scans did have no heading."""
+
 _SLIP_RPS = 0.15
 """A wheel slips where the turn of the wheels is off from that of an IMU by more (rad/s)."""
 
@@ -71,7 +74,7 @@ class WheelTruth:
     def remarks(self) -> list[str]:
         """What is wrong with the wheels, a line each."""
         if self.useless:
-            return ["the wheels turn when the scans do not, at any offset of their clocks: they are left out"]
+            return ["the wheels do not turn when the scans do, at any offset of their clocks: they are left out"]
         lines = []
         if self.offset_s:
             side = "ahead of" if self.offset_s > 0.0 else "behind"
@@ -129,6 +132,10 @@ class WheelClock:
     def _look(self) -> None:
         scans, wheels = self._signals()
         if min(len(scans), len(wheels)) < _LEAST_S / _CELL_S:
+            return
+        turned = np.abs(scans[:, 0]).sum(), np.abs(wheels[:, 0]).sum()
+        if turned[0] * _CELL_S > _LEAST_TURN_RAD and turned[1] < _NO_TURN * turned[0]:
+            self.truth = replace(self.truth, useless=True)
             return
         lags, correlation, turns = _correlation(scans[:, 0], wheels[:, 0])
         if not len(lags):
