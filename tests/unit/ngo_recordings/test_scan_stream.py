@@ -82,6 +82,17 @@ def test_odometry_with_velocities_alone_is_summed_up(tmp_path: Path) -> None:
         np.testing.assert_allclose(poses.read(standing), [1.0, 2.0, 0.5], atol=1e-12)
 
 
+def test_velocities_in_degrees_are_taken_so_once_no_robot_turns_as_fast() -> None:
+    poses, headings = OdometryPoses(), []
+    for k in range(60):
+        made = odometry(stamp(k), 0.0, 0.0, 0.0)
+        made.twist.twist = m.twist(0.5, 0.0, 0.4 if k < 5 else math.degrees(0.4))
+        pose = poses.read(made)
+        assert pose is not None
+        headings.append(pose[2])
+    np.testing.assert_allclose(np.diff(headings[10:]), 0.04, atol=1e-9)
+
+
 @pytest.mark.parametrize("lag_ns", [0, S // 5, 9 * S // 10])
 def test_records_come_in_order_of_their_stamps_however_late_they_were_recorded(tmp_path: Path, lag_ns: int) -> None:
     with open_recording([m.write_mcap(tmp_path / "a.mcap", drive(lag_ns=lag_ns))]) as recording:

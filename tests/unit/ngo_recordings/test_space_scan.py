@@ -157,6 +157,14 @@ def test_clouds_in_millimetres_are_taken_so(kind: str) -> None:
     assert np.isfinite(made.ranges).sum() > 1300 and off_walls(made).max() < 0.02
 
 
+def test_a_cloud_of_a_flat_lidar_needs_no_z() -> None:
+    azimuths = np.radians(np.arange(-180.0, 180.0, 0.2))
+    flat = fields(in_room(azimuths, np.zeros(len(azimuths))))
+    flat.pop("z")
+    made = cloud_scan(m.cloud(BEGIN_NS, flat), "/points")
+    assert np.isfinite(made.ranges).sum() > 1300 and off_walls(made).max() < 0.02
+
+
 def test_a_camera_without_its_description_is_named() -> None:
     image, info = depth_image("16UC1")
     with pytest.raises(RecordingError, match="no CameraInfo came on /camera/camera_info"):

@@ -55,16 +55,18 @@ def cloud_scan(message: Any, topic: str) -> LidarScan:
     """The scan in a PointCloud2 of any layout; each ray has the time of its points where these have one.
 
     Raises:
-        RecordingError: it has no x, y and z, no stamp, or data of another size than it says.
+        RecordingError: it has no x and y, no stamp, or data of another size than it says.
     """
     values = _records(message, topic)
     names = values.dtype.names or ()
     if "x" in names and (sane := _sane(values["x"])) < _MOSTLY:
         swapped = values.view(values.dtype.newbyteorder())
         values = swapped if _sane(swapped["x"]) > _MOSTLY > 2.0 * sane else values
-    if not {"x", "y", "z"} <= set(names):
+    if not {"x", "y"} <= set(names):
         raise RecordingError(f"a cloud of {topic} has the fields {', '.join(names) or 'none'}; expected x, y and z")
-    points = _metres(np.stack([values[name].astype(np.float64) for name in "xyz"], axis=-1))
+    flat = np.zeros(len(values))  # a lidar of one plane may leave z out
+    points = np.stack([values[name].astype(np.float64) if name in names else flat for name in "xyz"], axis=-1)
+    points = _metres(points)
     frame = str(message.header.frame_id).strip("/")
     if is_optical(frame):
         points = points[:, (2, 0, 1)] * (1.0, -1.0, -1.0)

@@ -8,6 +8,8 @@ import numpy as np
 import pytest
 
 from ngo_estimator.frontend.intake import sweep
+from ngo_estimator.frontend.intake.imu_turns import ImuTurns
+from ngo_estimator.frontend.intake.wheel_clock import CorrectedWheels, WheelTruth
 from ngo_estimator.frontend.lidar.mixture_lidar import MixtureLidar
 from ngo_estimator.geometry.planar_motion import Array, between, compose
 from ngo_estimator.geometry.scan_points import Mounting
@@ -142,6 +144,17 @@ def test_wheels_of_another_scale_are_scaled(way: float, turn: float, said: list[
     off_m, run = run_over(records(STILL, wheel_scale=np.array((way, way, turn))), STILL)
     assert off_m < 0.03
     assert all(each in line for each, line in zip(said, run.remarks(), strict=False))
+
+
+def test_a_driver_that_begins_anew_at_the_origin_again_and_again_made_no_step() -> None:
+    poses, wheels = drive(160), CorrectedWheels(ImuTurns())
+    given = [record for record in records(poses) if isinstance(record, WheelPose)]
+    begun = [between(given[k - k % 30].pose_xyyaw, each.pose_xyyaw) for k, each in enumerate(given)]
+    made = [wheels.add(each.stamp_ns, pose, WheelTruth())[1] for each, pose in zip(given, begun, strict=True)]
+    lost = np.array([between(made[k], made[k + 1]) for k in range(29, 300, 30)])
+    assert np.abs(lost).max() < 1e-12
+    kept = [between(made[k], made[k + 10]) - between(begun[k], begun[k + 10]) for k in range(60, 80)]
+    assert np.abs(kept).max() < 1e-9
 
 
 def test_odometry_in_millimetres_is_corrected_and_handed_on_as_it_was() -> None:

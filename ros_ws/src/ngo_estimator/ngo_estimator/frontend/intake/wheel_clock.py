@@ -245,7 +245,7 @@ def _far_off(scale: float) -> float:
 class CorrectedWheels:
     """The wheels with what is known of them: their poses by the scans' clock, and by the scans' scale.
 
-    A step that no robot makes, as where a driver begins anew, is none. Where an IMU is used, turns are its own.
+    A step that no robot makes is none, nor one back to the exact origin, where a driver begins anew. Where an IMU is used, turns are its own.
     """
 
     def __init__(self, imu: ImuTurns) -> None:
@@ -271,7 +271,8 @@ class CorrectedWheels:
             step = between(self._raw[-1][1], pose) * (truth.way_scale, turned, truth.turn_scale)
             elapsed_s = (stamp_ns - self._raw[-1][0]) * 1e-9
             step[2] = wrap(float(step[2]))
-            if not is_possible(step, elapsed_s):
+            begins_anew = not pose.any() and self._raw[-1][1].any()
+            if begins_anew or not is_possible(step, elapsed_s):
                 step, self._changed = np.zeros(3), True
             elif self._imu.used and step.any():
                 offset_ns = round(truth.offset_s * 1e9)
