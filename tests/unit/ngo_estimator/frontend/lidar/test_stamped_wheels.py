@@ -71,3 +71,14 @@ def test_noise_of_the_wheels_makes_no_lag(apart_ms: int) -> None:
         if k > 10:
             wheels.observe_turn(0.1 * k - 0.1, 0.1 * k, float(yaw(0.1 * k) - yaw(0.1 * k - 0.1)))
     assert wheels.lag_s == 0.0
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_a_robot_that_hardly_turns_shows_no_lag(seed: int) -> None:
+    noise, wheels = np.random.default_rng(seed), StampedWheels()
+    drift = np.cumsum(noise.normal(0.0, 0.02, 600))
+    for k in range(600):
+        wheels.add(round(0.1e9 * k), np.array((0.0, 0.0, drift[k])))
+        if k > 0:
+            wheels.observe_turn(0.1 * k - 0.1, 0.1 * k, float(noise.normal(0.0, 0.002)))
+        assert wheels.lag_s == 0.0

@@ -1,5 +1,7 @@
 """Stamped poses of the wheels, the pose at any time among them, and how late scans are by their clock."""
 
+import math
+
 import numpy as np
 from numba import njit
 
@@ -11,6 +13,7 @@ _EXTRAPOLATED_S = 0.5
 """Wheels whose last pose is older are silent."""
 
 _LAGS_S = np.linspace(-0.48, 0.48, 49)
+_NONE = int(np.abs(_LAGS_S).argmin())
 _REMEMBERED = 0.998
 """What a turn counts after the next one."""
 
@@ -20,8 +23,9 @@ _LEAST_TURNS = 60.0
 _TURNS_RAD = 0.02
 """A smaller turn between two scans tells no lag."""
 
-_BETTER = 0.9
-"""The lag must leave so much of what no lag leaves."""
+_BETTER, _SURE, _OF_TURNS = 0.9, 1.5, 0.6
+"""The lag must leave so much of what no lag leaves, less by so many deviations, and so much of all turns: the rest is the
+wheels' noise."""
 
 
 class StampedWheels:
@@ -34,8 +38,8 @@ class StampedWheels:
         self._origin_ns = 0
         self._period = UsualPeriod()
         self._pending: list[tuple[float, float, float]] = []
-        self._off = np.zeros(len(_LAGS_S))
-        self._turns = 0.0
+        self._off, self._squares = np.zeros((2, len(_LAGS_S)))  # sums, and squared differences from no lag
+        self._turns = self._turned = 0.0
         self.lag_s = 0.0
         """How much older scans are than their stamps (s); 0 until it is known."""
 
@@ -104,7 +108,10 @@ class StampedWheels:
             by_wheels = _turns(rows, start, end)
             if max(abs(turn), by_wheels.max(), -by_wheels.min()) < _TURNS_RAD:
                 continue
-            self._off = _REMEMBERED * self._off + np.minimum(np.abs(by_wheels - turn), 10.0 * _TURNS_RAD)
+            off = np.minimum(np.abs(by_wheels - turn), 10.0 * _TURNS_RAD)
+            self._off = _REMEMBERED * self._off + off
+            self._squares = _REMEMBERED**2 * self._squares + (off - off[_NONE]) ** 2
+            self._turned = _REMEMBERED * self._turned + abs(turn)
             self._turns = _REMEMBERED * self._turns + 1.0
         if len(self._pending) > _KEPT:
             self._pending.pop(0)
@@ -113,9 +120,11 @@ class StampedWheels:
 
     def _learned(self) -> float:
         best = int(self._off.argmin())
-        middle = int(np.abs(_LAGS_S).argmin())
-        if self._off[best] > _BETTER * self._off[middle] or not 0 < best < len(_LAGS_S) - 1:
-            return 0.0 if not 0 < best < len(_LAGS_S) - 1 else self.lag_s
+        if best == _NONE or not 0 < best < len(_LAGS_S) - 1:
+            return 0.0
+        most = self._off[_NONE] - _SURE * math.sqrt(self._squares[best])
+        if self._off[best] > min(_BETTER * self._off[_NONE], most, _OF_TURNS * self._turned):
+            return self.lag_s
         left, here, right = self._off[best - 1 : best + 2]
         bend = left - 2.0 * here + right
         shift = 0.5 * (left - right) / bend if bend > 0.0 else 0.0
