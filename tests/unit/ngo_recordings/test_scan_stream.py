@@ -315,7 +315,7 @@ def test_two_robots_whose_frames_have_the_same_names_are_told(tmp_path: Path) ->
         entries.append(("/tf_static", at, m.transforms(static("base_link", "laser", x, 0.0, 0.0))))
     with open_recording([m.write_mcap(tmp_path / "a.mcap", sorted(entries, key=lambda entry: entry[1]))]) as recording:
         notes = describe_lidar(recording, choose_topics(recording)).notes
-    assert [note for note in notes if "robots with the same frames cannot be told apart" in note]
+    assert [note for note in notes if "robots whose frames have the same names cannot be told apart" in note]
 
 
 def test_time_without_scans_speaks_for_no_mounting(tmp_path: Path) -> None:

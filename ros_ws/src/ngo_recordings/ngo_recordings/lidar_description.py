@@ -101,20 +101,17 @@ def _others(recording: Recording, topics: RecordingTopics, mounting: Mounting | 
         others = ", ".join(_with_rate(recording, name) for name in more)
         used = ", ".join(topics.scans)
         notes.append(f"scans of {used} are used; others are {others}: --image names another one, --scan-topics several")
-        if mounting is not None and mounting.changes and mounting.scan_frame in (_frame(recording, each) for each in more):
+        frames = {str(recording.first(name).value.header.frame_id).strip("/") for name in more}
+        if mounting is not None and mounting.changes and mounting.scan_frame in frames:
             notes.append(
-                f"two scanners have the frame {mounting.scan_frame}, and it has two places: robots with the same frames "
-                "cannot be told apart, give each a prefix"
+                f"two scanners have the frame {mounting.scan_frame}, and it has two places: robots whose frames have "
+                "the same names cannot be told apart, give each a prefix"
             )
     if len(wheels) > 1:
         taken = "no odometry" if topics.wheels is None else str(topics.wheels)
         there = ", ".join(_with_rate(recording, name) for name in wheels)
         notes.append(f"{taken} is used of {there}: --wheels names another one")
     return notes
-
-
-def _frame(recording: Recording, name: str) -> str:
-    return str(recording.first(name).value.header.frame_id).strip("/")
 
 
 def _with_rate(recording: Recording, name: str) -> str:

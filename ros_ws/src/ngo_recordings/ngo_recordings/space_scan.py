@@ -119,16 +119,16 @@ def _matrix_of(info: Any, width: int, height: int) -> np.ndarray | None:
 
     None where the CameraInfo is of another view, or of none.
     """
-    matrix, roi = camera_matrix(info).copy(), getattr(info, "roi", None)
+    matrix = camera_matrix(info).copy()
     if not matrix.size:
         return None
-    of_part = roi is not None and roi.width > 0 and roi.height > 0
-    own = info.width or 2.0 * matrix[2] + 1.0, info.height or 2.0 * matrix[5] + 1.0
-    whole = (roi.width, roi.height) if of_part else own
+    whole, corner = (info.width or 2.0 * matrix[2] + 1.0, info.height or 2.0 * matrix[5] + 1.0), (0, 0)
+    roi = getattr(info, "roi", None)
+    if roi is not None and roi.width > 0 and roi.height > 0:
+        whole, corner = (roi.width, roi.height), (roi.x_offset, roi.y_offset)
     across, down = width / whole[0], height / whole[1]
     if abs(across / down - 1.0) > _SAME_VIEW:
         return None
-    corner = (roi.x_offset, roi.y_offset) if of_part else (0.0, 0.0)
     matrix[[0, 4]] *= across, down
     matrix[[2, 5]] = (matrix[[2, 5]] - corner + 0.5) * (across, down) - 0.5
     return matrix

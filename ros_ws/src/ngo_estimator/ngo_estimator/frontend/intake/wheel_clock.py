@@ -245,7 +245,8 @@ def _far_off(scale: float) -> float:
 class CorrectedWheels:
     """The wheels with what is known of them: their poses by the scans' clock, and by the scans' scale.
 
-    A step that no robot makes is none, nor one back to the exact origin, where a driver begins anew. Where an IMU is used, turns are its own.
+    A step that no robot makes is none, nor one back to the exact origin, where a driver begins anew. Where an IMU is
+    used, turns are its own.
     """
 
     def __init__(self, imu: ImuTurns) -> None:

@@ -24,8 +24,8 @@ _TURNS_RAD = 0.02
 """A smaller turn between two scans tells no lag."""
 
 _BETTER, _SURE, _OF_TURNS = 0.9, 1.5, 0.6
-"""The lag must leave so much of what no lag leaves, less by so many deviations, and so much of all turns: the rest is the
-wheels' noise."""
+"""The lag must leave so much of what no lag leaves, less by so many deviations, and so much of all turns: the rest is
+the wheels' noise."""
 
 
 class StampedWheels:
