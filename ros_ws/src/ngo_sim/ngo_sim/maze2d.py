@@ -168,11 +168,8 @@ class Maze2D(gymnasium.Env[npt.NDArray[np.float32], np.int64]):
         self._turn_rate_rad = config.turn_decay * (self._turn_rate_rad + turn)
         self._velocity_m = self._move_body(self._space, velocity_x, velocity_y)
         last_x, last_y = self._x, self._y
-        self._x, self._y = self._body.position
-        self._yaw = math.remainder(self._body.angle, math.tau)
-        self._frame += 1
-        travelled = math.hypot(self._x - last_x, self._y - last_y)
-        return self._scan(), travelled, False, False, self._info()
+        observation, info = self._next_frame()
+        return observation, math.hypot(self._x - last_x, self._y - last_y), False, False, info
 
     def drive(self, speed_mps: float, turn_rate_rps: float) -> tuple[npt.NDArray[np.float32], dict[str, Any]]:
         """Let period_s pass at this speed along the heading and turn rate; a wall that is met stops the robot.
@@ -188,6 +185,9 @@ class Maze2D(gymnasium.Env[npt.NDArray[np.float32], np.int64]):
         left_x, left_y = self._move_body(self._space, way * math.cos(heading), way * math.sin(heading))
         self.blocked = math.hypot(left_x, left_y) < (1.0 - _BLOCKED_SHARE) * abs(way)
         self._velocity_m = (0.0, 0.0) if self.blocked else (left_x, left_y)
+        return self._next_frame()
+
+    def _next_frame(self) -> tuple[npt.NDArray[np.float32], dict[str, Any]]:
         self._x, self._y = self._body.position
         self._yaw = math.remainder(self._body.angle, math.tau)
         self._frame += 1

@@ -17,7 +17,7 @@ from ngo_estimator.nodes import messages
 from ngo_estimator.nodes.loop_message import LoopMarkerWriter, loop_colors, plain_loops
 from ngo_estimator.nodes.messages import relative_pose_message, relative_step
 from ngo_estimator.nodes.path_message import PathWriter, plain_path
-from ngo_estimator.nodes.step_messages import TYPES, StepMessages
+from ngo_estimator.nodes.step_messages import ODOMETRY, POSE, TF, TYPES, StepMessages
 from ngo_estimator.slam.scan_trajectory import ScanTrajectory
 from ngo_estimator.slam.trajectory_update import Trajectory as WholeTrajectory
 from ngo_estimator.slam.trajectory_update import TrajectoryUpdate
@@ -206,6 +206,7 @@ def test_what_is_thought_of_a_loop_shows_in_its_color() -> None:
 
 @pytest.mark.parametrize("frames", [("base_link", "odom", "map"), ("b", "my_robot/odom", "käfig")])
 def test_equal_the_plain_messages_for_each_step(frames: tuple[str, str, str]) -> None:
+    base, odom, map_frame = frames
     store, rng, nothing = get_typestore(Stores.ROS2_JAZZY), np.random.default_rng(20000), np.zeros(0, np.float32)
 
     def serialised(message: object, type_name: str) -> bytes:
@@ -221,7 +222,13 @@ def test_equal_the_plain_messages_for_each_step(frames: tuple[str, str, str]) ->
             end_ns, begin_ns, poses[0], step_covariance, 0, poses[1], nothing, nothing, robot_odom_xyyaw=robot
         )
         update = TrajectoryUpdate(end_ns, poses[2], covariance, poses[3], 2, False, False, False, 0.0, 0, 0.0, "")
-        plain = writer.plain(step, odometry, update)
+        transforms = messages.transform_message(end_ns, map_frame, odom, update.map_from_odom_xyyaw)
+        transforms.transforms += messages.transform_message(end_ns, odom, base, step.tf_odom_xyyaw).transforms
+        plain = {
+            ODOMETRY: messages.odometry_message(step, odometry, odom, base),
+            POSE: messages.pose_message(end_ns, map_frame, update.pose_xyyaw, covariance),
+            TF: transforms,
+        }
         assert writer.of(step, odometry, update) == {
             topic: serialised(message, TYPES[topic]) for topic, message in plain.items()
         }

@@ -105,7 +105,6 @@ class StepMessages:
     def __init__(
         self, base_frame: str, odom_frame: str, map_frame: str, serialise: Callable[[Any, str], bytes]
     ) -> None:
-        self._base, self._odom, self._map = base_frame, odom_frame, map_frame
         self._odometry = OdometryWriter(odom_frame, base_frame, lambda message: serialise(message, TYPES[ODOMETRY]))
         self._pose = PoseWriter(map_frame, lambda message: serialise(message, TYPES[POSE]))
         frames = (map_frame, odom_frame), (odom_frame, base_frame)
@@ -117,17 +116,6 @@ class StepMessages:
             ODOMETRY: self._odometry.write(step, odom_covariance),
             POSE: self._pose.write(step.stamp_ns, update.pose_xyyaw, update.covariance),
             TF: self._transforms.write(step.stamp_ns, update.map_from_odom_xyyaw, step.tf_odom_xyyaw),
-        }
-
-    def plain(self, step: "RelativeStep", odom_covariance: np.ndarray, update: "TrajectoryUpdate") -> dict[str, Any]:
-        """The same as objects: the slow definition of what ``of`` writes."""
-        transforms = messages.transform_message(step.stamp_ns, self._map, self._odom, update.map_from_odom_xyyaw)
-        below = messages.transform_message(step.stamp_ns, self._odom, self._base, step.tf_odom_xyyaw)
-        transforms.transforms = [*transforms.transforms, *below.transforms]
-        return {
-            ODOMETRY: messages.odometry_message(step, odom_covariance, self._odom, self._base),
-            POSE: messages.pose_message(step.stamp_ns, self._map, update.pose_xyyaw, update.covariance),
-            TF: transforms,
         }
 
 
