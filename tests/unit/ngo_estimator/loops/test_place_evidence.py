@@ -1,10 +1,12 @@
 """Evidence that a stretch of the way is, or is not, in a place: answers that are known."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from ngo_estimator.geometry.planar_motion import rotated
-from ngo_estimator.loops.place_evidence import distinct_walls, place_evidence
+from ngo_estimator.loops.place_evidence import PlaceEvidence, distinct_walls, place_evidence
 from ngo_estimator.loops.walls_seen_through import PlacedScans, placed, range_profile
 from tests.unit.ngo_estimator.loops.buildings import HALLWAY, outline, scan_at
 
@@ -37,6 +39,16 @@ def test_the_same_place_agrees_and_another_one_is_seen_through() -> None:
     same, other = (place_evidence(place, (stretch,)) for stretch in others)
     assert same.walls >= 7 and same.through < 0.02 and same.said == 2
     assert other.walls < same.walls and other.through > 0.05
+
+
+def test_a_map_that_contradicts_itself_may_be_contradicted_and_a_place_as_likely_is_a_rival() -> None:
+    steady, opened = scans(HALLWAY), scans(LONGER, 1)
+    pairs = zip(vars(steady).values(), vars(opened).values(), strict=True)
+    both = PlacedScans(*(np.concatenate(pair) for pair in pairs))
+    assert place_evidence(steady, (steady,)).own == 0.0 and place_evidence(both, (steady,)).own > 0.003
+    at, bent = PlaceEvidence(8, 0.5, 3, mean=0.1, own=0.02), PlaceEvidence(8, 0.5, 3, mean=0.1, own=0.002)
+    assert at.suffices and not bent.suffices and not PlaceEvidence(7, 0.0, 3).suffices
+    assert bent.rivals(at) and not bent.rivals(replace(at, mean=0.04)) and not replace(bent, walls=7).rivals(at)
 
 
 def test_the_worst_part_of_the_stretch_counts_and_one_far_away_says_nothing() -> None:

@@ -11,16 +11,6 @@ from ngo_estimator.slam.scan_matcher import REACH_M, ScanMatcher
 from tests.unit.ngo_estimator.lidar_steps import lidar_steps
 from tests.unit.ngo_estimator.loops.buildings import HALLWAY, ROUND, outline, scan_at, way
 
-ROOM = np.concatenate(
-    (
-        [(0, 2, 0, 7), (0, 7, 6, 7), (6, 7, 6, 2), (0, 2, 2, 2), (3, 2, 6, 2), (6, 2, 7, 2), (0, 0, 7, 0)],
-        outline((4, 5), (5.2, 5), (5.2, 5.8), (4, 5.8)),
-        outline((0.6, 4), (1.4, 4.3), (1.1, 5)),
-    )
-)
-"""With a stretch of the corridor before its door; the next one is 7 m farther."""
-IN_AND_OUT = ((0.5, 1), (2.5, 1), (2.5, 4.2), (2.5, 1))
-
 
 def matcher_of(
     walls: np.ndarray, poses: np.ndarray, reach_m: float = REACH_M, parts: np.ndarray | None = None
@@ -28,12 +18,6 @@ def matcher_of(
     random = np.random.default_rng(0)
     scans = [scan_at(walls, pose, random) for pose in poses]
     return ScanMatcher(scans, poses, KeyScanViews().of_map(scans), ScanLoopConfig(), reach_m, parts)
-
-
-def test_rooms_that_look_alike_are_noticed_and_corners_of_a_ring_are_told_apart() -> None:
-    rooms = np.concatenate([ROOM + (x, 0, x, 0) for x in (0, 7, 14)])
-    assert matcher_of(rooms, way(*[(x + dx, y) for x in (0, 7, 14) for dx, y in IN_AND_OUT])).has_alike_places()
-    assert not matcher_of(HALLWAY, way(*ROUND, ROUND[0])).has_alike_places()
 
 
 def test_a_way_is_clear_at_its_place_by_the_walls_that_it_has_in_common_with_the_map() -> None:

@@ -89,17 +89,17 @@ def test_a_robot_that_starts_anew_is_found_again_and_lost_steps_cost_nothing() -
     drive(fleet, "red", robots()["red"])
     before = fleet.trajectory("red")
     assert before is not None
-    lost = drive(fleet, "red", anew[:20])
+    lost = drive(fleet, "red", anew[:12])
     assert len(fleet.core.back_end._own_maps) == 1  # none of the stream that ended
     assert lost[0].begins and not any(update.begins for update in lost[1:])
     assert all(update.map_of == "red" and not update.update.restarted for update in lost)
     whole = fleet.core.trajectory()
     assert whole is not None
     np.testing.assert_array_equal(whole.poses_xyyaw[:COUNT], before.poses_xyyaw)
-    found = drive(fleet, "red", anew[25:])  # a burst behind a silence, of which five were lost
+    found = drive(fleet, "red", anew[17:])  # a burst behind a silence, of which five were lost
     assert found[0].update.gap and found[-1].map_of is None
     fleet.finish()
-    truth = np.concatenate((FIRST, np.delete(BACK[:61], range(21, 26), axis=0)))
+    truth = np.concatenate((FIRST, np.delete(BACK[:61], range(13, 18), axis=0)))
     assert off_m(fleet, "red", FIRST[0], truth) < 0.1
 
 

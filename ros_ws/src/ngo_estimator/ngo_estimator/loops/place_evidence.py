@@ -35,9 +35,9 @@ _MOST_POINTS = 2000
 _SAID = 40
 """Sightings from which on their share says something."""
 
-_LEAST_WALLS, _MOST_MEAN, MOST_THROUGH = 8, 0.15, 0.33
-"""A claim needs so many different walls. The way may look through so much of the walls in the mean, and each of its
-parts through so much at most."""
+_LEAST_WALLS, _MOST_MEAN, _OWN_TIMES = 8, 0.02, 4.5
+"""A claim needs so many different walls. The way may look through so much of the walls in the mean, and so many times
+as much as the place's own scans do: where people walk, and doors and furniture move, a map contradicts itself."""
 
 _CLEAR_MEAN, _CLEAR_THROUGH, _FEWEST_WALLS = 0.07, 0.15, 4
 """A way that was just driven looks through so much of the walls of a good map at most in the mean, and so much in each
@@ -51,8 +51,8 @@ class PlaceEvidence:
 
     ``through``: the largest share of sightings through walls. ``said``: in how many parts of the stretch there were
     sightings enough for a share. ``seen``: all sightings, and
-    ``mean``: the share of those of them that go through walls. ``overlap``: the share of points of one side that the
-    other one sees, or sees through.
+    ``mean``: the share of those of them that go through walls, and ``own`` that of the place's scans among each other.
+    ``overlap``: the share of points of one side that the other one sees, or sees through.
     """
 
     walls: int
@@ -61,11 +61,16 @@ class PlaceEvidence:
     seen: int = 0
     mean: float = 0.0
     overlap: float = 0.0
+    own: float = 0.0
 
     @property
     def suffices(self) -> bool:
         """Whether a stretch of the way and a place have enough in common, and contradict each other little."""
-        return self.walls >= _LEAST_WALLS and self.mean <= _MOST_MEAN and self.through <= MOST_THROUGH
+        return self.walls >= _LEAST_WALLS and self.mean <= _MOST_MEAN + _OWN_TIMES * self.own
+
+    def rivals(self, better: "PlaceEvidence") -> bool:
+        """Whether this is nearly as likely as a better place: the way looks through less than twice as much."""
+        return self.walls >= _LEAST_WALLS and self.mean <= max(_MOST_MEAN, 2.0 * better.mean)
 
     @property
     def is_clear(self) -> bool:
@@ -126,16 +131,11 @@ def last_stretch(poses: np.ndarray, first: int, most_m: float = STRETCH_M) -> np
     return np.arange(len(poses) - 1 - int(np.searchsorted(to_end, most_m)), len(poses))
 
 
-def stretch_length_m(poses: np.ndarray) -> float:
-    """How long the last stretch of the way of poses ``(keys, 3)`` is, in quarters of the longest."""
-    length_m, quarter_m = float(np.hypot(*np.diff(poses[:, :2], axis=0).T).sum()), 0.25 * STRETCH_M
-    return min(STRETCH_M, quarter_m * max(1.0, float(np.ceil(length_m / quarter_m))))
-
-
 def place_evidence(place: PlacedScans, stretch: Sequence[PlacedScans], count_walls: bool = True) -> PlaceEvidence:
     """The evidence of the parts of a stretch, each of some scans, in the frame of the place's scans."""
     counts, possible = [], 1
-    place, points, normals = _steady(_thinned(place)), [np.zeros((0, 2))], [np.zeros((0, 2))]
+    place, own = _steady(_thinned(place))
+    points, normals = [np.zeros((0, 2))], [np.zeros((0, 2))]
     for part in map(_thinned, stretch):
         ours = sightings(place.sensors, place.profiles, part.points)
         its = sightings(part.sensors, part.profiles, place.points)
@@ -150,7 +150,7 @@ def place_evidence(place: PlacedScans, stretch: Sequence[PlacedScans], count_wal
     through, on = np.sum([(0, 0), *counts], axis=0).tolist()
     seen = through + on
     return PlaceEvidence(
-        walls, max(shares, default=0.0), len(shares), seen, mean=through / max(1, seen), overlap=seen / possible
+        walls, max(shares, default=0.0), len(shares), seen, through / max(1, seen), seen / possible, own
     )
 
 
@@ -176,10 +176,13 @@ def _thinned(scans: PlacedScans) -> PlacedScans:
     return replace(scans, points=scans.points[one], normals=scans.normals[one])
 
 
-def _steady(scans: PlacedScans) -> PlacedScans:
-    """Without points that the same scans mostly see through: people walked there."""
-    through, on = sightings(scans.sensors, scans.profiles, scans.points).T
-    return replace(scans, points=scans.points[on > through], normals=scans.normals[on > through])
+def _steady(scans: PlacedScans) -> tuple[PlacedScans, float]:
+    """Without points that the same scans mostly see through, of people, and the share of the others that they do."""
+    seen = sightings(scans.sensors, scans.profiles, scans.points)
+    stays = seen[:, 1] > seen[:, 0]
+    through, on = seen[stays].sum(0).tolist()
+    steady = replace(scans, points=scans.points[stays], normals=scans.normals[stays])
+    return steady, through / max(1, through + on)
 
 
 @njit(cache=True)

@@ -163,11 +163,6 @@ def agreeing(hypotheses: Hypotheses, pose: np.ndarray, covariance: np.ndarray, p
     return _agree(distance, turn, _variances(hypotheses.covariance) + _variances(covariance), place_m)
 
 
-def elsewhere(poses: np.ndarray, pose: np.ndarray, place_m: float) -> np.ndarray:
-    """Which of the poses ``(n, 3)`` are in another place than a pose ``(3,)``."""
-    return _well_apart(*_apart(poses, pose), place_m)
-
-
 def support(hypotheses: Hypotheses, which: np.ndarray) -> float:
     """The belief of the best of each look, of those in ``which`` ``(n,)``, summed."""
     if len(hypotheses.look) == 0:

@@ -2,9 +2,9 @@
 
 The key scans that are searched are those of parts of the map that no loop joins with the newest one, and those that are
 so far from it through the graph that it may be outside of the widest window. As in a saved map, a pose is claimed where
-sightings of several scans agree by the odometry between them, and no other pose has nearly as many. Here the whole last
-stretch of the way must also agree with the place, in more walls than places have in common by chance. Each of these
-sightings is then a loop. The corrector may still refuse it, and the next scans may contradict it.
+sightings of several scans agree by the odometry between them, and the last stretch of the way agrees with the place, in
+more walls than places have in common by chance, and with no other place nearly as well. Each of these sightings is then
+a loop. The corrector may still refuse it, and the next scans may contradict it.
 """
 
 from __future__ import annotations
@@ -20,13 +20,13 @@ from ngo_estimator.geometry.planar_motion import between, compose, turned_covari
 from ngo_estimator.graph.pose_graph import PoseGraph
 from ngo_estimator.graph.segments import segment_of
 from ngo_estimator.loops.key_scan_views import KeyScanViews
-from ngo_estimator.loops.place_evidence import MOST_THROUGH, PlaceEvidence, evidence_of, last_stretch
+from ngo_estimator.loops.place_evidence import PlaceEvidence, evidence_of, last_stretch
 from ngo_estimator.loops.scan_loops import EVIDENCE, ScanLoops
 from ngo_estimator.loops.scan_settings import ScanGraphConfig
 from ngo_estimator.loops.scan_submaps import laid_together
 from ngo_estimator.slam.evidence import HypothesisWindow, agreeing, fused, strongest_modes
 from ngo_estimator.slam.localisation import LocalisationConfig, may_claim
-from ngo_estimator.slam.scan_matcher import REACH_M, WAY_KEYS, ScanMatcher
+from ngo_estimator.slam.scan_matcher import REACH_M, ScanMatcher
 from ngo_estimator.slam.sightings import Sightings
 
 _GROWN = 1.1
@@ -110,16 +110,14 @@ class OwnMap:
         modes = strongest_modes(hypotheses, place_m)
         if not modes:
             return ScanLoops.none()
-        # Before the first sighting the robot was perhaps where it had never been.
-        since = len(self._window) - int(modes[0].looks[0])
-        if not may_claim(self._claims, self._window, modes[0], modes[1:], place_m, since):
+        # Between sightings the robot was perhaps where it had never been.
+        if not may_claim(self._claims, self._window, modes[0], (), place_m, 0):
             return ScanLoops.none()
         agree = agreeing(hypotheses, modes[0].pose_xyyaw, modes[0].covariance, place_m)
         pose, _ = fused(hypotheses.where(agree), modes[0].pose_xyyaw)
-        if not self._evidence(pose, scans, views, graph).suffices:
-            return ScanLoops.none()
-        if self._is_ambiguous(int(self._keys[_nearest(self._poses, pose[None])[0]]), scans, views, graph):
-            self._forget_looks()
+        rivals = [mode.pose_xyyaw for mode in modes[1:] if mode.support > self._claims.most_rival * modes[0].support]
+        found, *others = (self._evidence(at, scans, views, graph) for at in (pose, *rivals))
+        if not found.suffices or any(other.rivals(found) for other in others):
             return ScanLoops.none()
         loops = self._loops(agree, self.looks[hypotheses.look], modes[0].support)
         self._forget_looks()
@@ -135,16 +133,6 @@ class OwnMap:
         at = se2.compose(pose, se2.between(graph.poses[-1], graph.poses[stretch]))
         return evidence_of(scans, views, (stretch, at), (self._keys, self._poses), count_walls=True)
 
-    def _is_ambiguous(self, there: int, scans: Sequence[KeyScan], views: KeyScanViews, graph: PoseGraph) -> bool:
-        """Whether places look alike on the robot's own way, or on that of a key scan where it would be found."""
-        ends = np.append(graph.segments, len(graph))
-        for segment in {int(segment_of(graph.segments, np.array(there))), len(graph.segments) - 1}:
-            way = np.arange(max(ends[segment], ends[segment + 1] - WAY_KEYS), ends[segment + 1])
-            matcher = self._searching(way, graph.poses[way], scans, views)
-            if matcher and matcher.has_alike_places():
-                return True
-        return False
-
     def contradicted(self, scans: Sequence[KeyScan], views: KeyScanViews, graph: PoseGraph, parts: np.ndarray) -> bool:
         """Whether the key scans since the newest segment was joined show that it lies elsewhere.
 
@@ -158,7 +146,7 @@ class OwnMap:
         found = evidence_of(scans, views, (last, graph.poses[last]), (others, graph.poses[others]))
         if found.said:
             self._trial -= 1
-            self._against = self._against + 1 if found.through > MOST_THROUGH else 0
+            self._against = self._against + 1 if found.mean > _ELSEWHERE else 0
         if self._against < _CONTRADICTIONS:
             return False
         self._trial = self._against = 0
@@ -230,17 +218,12 @@ class OwnMap:
     def _matcher_of(self, scans: Sequence[KeyScan], views: KeyScanViews) -> ScanMatcher | None:
         """What searches in them; None where none of them has a point."""
         if self._matcher is None:
-            self._matcher = self._searching(self._keys, self._poses, scans, views)
+            keys = self._keys.tolist()
+            chosen = [scans[key] for key in keys]
+            if any(len(scan.points) for scan in chosen):
+                views = views.of_keys(keys)
+                self._matcher = ScanMatcher(chosen, self._poses, views, self._config.loops, REACH_M)
         return self._matcher
-
-    def _searching(
-        self, keys: np.ndarray, poses: np.ndarray, scans: Sequence[KeyScan], views: KeyScanViews
-    ) -> ScanMatcher | None:
-        """What searches in key scans ``(n,)`` at poses ``(n, 3)``; None where none of them has a point."""
-        chosen = [scans[key] for key in keys.tolist()]
-        if not any(len(scan.points) for scan in chosen):
-            return None
-        return ScanMatcher(chosen, poses, views.of_keys(keys.tolist()), self._config.loops, REACH_M)
 
     def _laid_anew(self, seen: Sightings, keys: np.ndarray, poses: np.ndarray) -> Sightings:
         """Sightings in a map that lay otherwise: each goes with the key scan that was nearest."""

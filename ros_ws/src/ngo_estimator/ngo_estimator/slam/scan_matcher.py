@@ -16,21 +16,11 @@ from ngo_estimator.geometry.branch_and_bound import pooled_grid, search
 from ngo_estimator.geometry.key_scan import KeyScan
 from ngo_estimator.geometry.planar_motion import between, compose, transformed, turned_covariance
 from ngo_estimator.loops.key_scan_views import KeyScanViews
-from ngo_estimator.loops.place_evidence import (
-    MOST_SCANS,
-    NEAR_M,
-    STRETCH_M,
-    PlaceEvidence,
-    evidence_at,
-    evidence_of,
-    last_stretch,
-    stretch_length_m,
-)
+from ngo_estimator.loops.place_evidence import MOST_SCANS, NEAR_M, PlaceEvidence, evidence_at, last_stretch
 from ngo_estimator.loops.scan_fit import fit, search_points
 from ngo_estimator.loops.scan_settings import ScanLoopConfig
 from ngo_estimator.loops.scan_submaps import SUBMAP_VARIANCE, ScanSubmaps, around_in_time, laid_together
 from ngo_estimator.loops.walls_seen_through import PlacedScans, placed, range_profile
-from ngo_estimator.slam.evidence import elsewhere
 from ngo_estimator.slam.sightings import Sightings
 
 _MARGIN_M = 2.0  # around the key scans of the map, where the robot may be
@@ -42,12 +32,6 @@ _MOST_RECENT = 64  # key scans of the way that are kept
 
 REACH_M = 2.0
 """How far the robot is from where a robot was before, where it is found in a map that grows."""
-
-WAY_KEYS, _ALIKE_LOOKS = 400, 24
-"""Of a way's key scans is asked whether places look alike: of so many together, at so many places."""
-
-_MOST_ALIKE = 0.1
-"""Where a larger share of places is alike, what looks the same may be another place."""
 
 
 class ScanMatcher:
@@ -81,7 +65,6 @@ class ScanMatcher:
         self._scans, self._poses, self._views = scans, poses, views.of_map(scans)
         self._config, self._parts = config, parts
         self._submaps = ScanSubmaps(config)
-        self._ambiguous: dict[tuple[int, float], bool] = {}
         together = np.concatenate(points)
         if reach_m < math.inf:  # a map that grows is made again and again
             together = _one_a_cell(together, 0.5 * config.search.resolution_m)
@@ -140,47 +123,8 @@ class ScanMatcher:
         return self._evidence(pose).is_clear
 
     def allows(self, pose: np.ndarray) -> bool:
-        """Whether many sightings are enough: the way and the map agree there, and places around do not look alike."""
-        return self._evidence(pose).suffices and not self._is_ambiguous(pose)
-
-    def _is_ambiguous(self, pose: np.ndarray) -> bool:
-        """Whether places look alike among the key scans around a pose, to a robot that has seen as much."""
-        there, half = int(np.linalg.norm(self._poses[:, :2] - pose[:2], axis=1).argmin()), WAY_KEYS // 2
-        first = max(0, min(there // half * half - half // 2, len(self._scans) - WAY_KEYS))
-        way_m = stretch_length_m(np.stack(self._odometry))
-        if (first, way_m) not in self._ambiguous:
-            keys = slice(first, first + WAY_KEYS)
-            scans, views = self._scans[keys], self._views.of_keys(range(*keys.indices(len(self._scans))))
-            searched = any(len(scan.points) for scan in scans) and ScanMatcher(
-                scans, self._poses[keys], views, self._config, REACH_M
-            )
-            self._ambiguous[first, way_m] = bool(searched and searched.has_alike_places(way_m))
-        return self._ambiguous[first, way_m]
-
-    def has_alike_places(self, way_m: float = STRETCH_M) -> bool:
-        """Whether places look alike in the map: it is searched in itself, where the truth is known.
-
-        Two robots that have been in one room each cannot know whether it is the same room. A robot that has seen
-        several rooms knows whether rooms are alike here: the evidence for a claim is asked about places that are
-        certainly others. The map is one way, whose key scans follow each other and whose poses are sure of each other.
-        The evidence is that of ``way_m`` of it.
-        """
-        before = self._config.source_keys - 1
-        if len(self._scans) <= before:
-            return False
-        looks = np.unique(np.linspace(before, len(self._scans) - 1, _ALIKE_LOOKS).astype(np.int64))
-        return sum(self._is_alike(key, way_m) for key in looks.tolist()) > _MOST_ALIKE * len(looks)
-
-    def _is_alike(self, key: int, way_m: float) -> bool:
-        """Whether the evidence for a key scan's place would suffice at another place, too."""
-        scans, views, poses = self._scans, self._views, self._poses
-        source = slice(key + 1 - self._config.source_keys, key + 1)
-        seen = self.search(laid_together(scans[source], views.profiles[source], poses[source])).poses
-        stretch = last_stretch(poses[: key + 1], 0, way_m)
-        since = se2.between(poses[key], poses[stretch])
-        others = (se2.compose(pose, since) for pose in seen[elsewhere(seen, poses[key], self.place_m)])
-        place = np.arange(len(scans)), poses
-        return any(evidence_of(scans, views, (stretch, at), place, count_walls=True).suffices for at in others)
+        """Whether many sightings are enough: the way and the map agree there."""
+        return self._evidence(pose).suffices
 
     def _evidence(self, pose: np.ndarray) -> PlaceEvidence:
         """How the last stretch of the way agrees with the map, where the newest frame is at ``pose`` ``(3,)``."""
