@@ -22,18 +22,22 @@ def kept_details(description: dict[str, Any]) -> dict[str, Any]:
     return {name: value for name, value in description.items() if name not in _OWN}
 
 
+_WRITTEN = ("docs", "training/results")
+"""Where tables write: the next cell is measured by the same code."""
+
+
 class RunError(ValueError):
     """The files of a run and its arguments do not fit together; the message is one line with the remedy."""
 
 
 def revision() -> str:
-    """The commit that is checked out, with ``+changes`` where files differ from it."""
+    """The commit that is checked out, with ``+changes`` where files differ from it that no table writes."""
     try:
         commit = subprocess.run(
             ["git", "rev-parse", "--short", "HEAD"], cwd=ROOT, check=True, capture_output=True, text=True
         ).stdout.strip()
         changes = subprocess.run(
-            ["git", "status", "--porcelain", "--untracked-files=no"],
+            ["git", "status", "--porcelain", "--untracked-files=no", "--", ".", *(f":!{path}" for path in _WRITTEN)],
             cwd=ROOT,
             check=True,
             capture_output=True,

@@ -55,6 +55,20 @@ class Switches:
     prefixes: tuple[int, ...] = (1, 2)
 
 
+def test_what_tables_write_is_no_change_of_what_is_measured(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(records, "ROOT", tmp_path)
+    git = ["git", "-c", "user.name=a", "-c", "user.email=a@b.c"]
+    files = [tmp_path / name for name in ("docs/results.md", "training/results/all.json", "training/code.py")]
+    for file in files:
+        file.parent.mkdir(parents=True, exist_ok=True)
+        file.write_text("before")
+    for command in (["init", "-q"], ["add", "."], ["commit", "-qm", "All"]):
+        subprocess.run([*git, *command], cwd=tmp_path, check=True)
+    for file, changed in zip(files, (False, False, True), strict=True):
+        file.write_text("after")
+        assert records.revision().endswith("+changes") == changed
+
+
 @pytest.mark.parametrize(
     ("given", "flags"),
     [
