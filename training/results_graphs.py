@@ -33,7 +33,7 @@ GRAPHS = ("synthetic_1000", "synthetic_3000", "hard_1000", "hard_3000", "lecture
 _ONLINE = "_online"
 """Ending of a graph whose loops come in blocks: its numbers are means over the blocks."""
 
-_ALL_GRAPHS = (*GRAPHS, *(f"{graph}{_ONLINE}" for graph in GRAPHS))
+_ALL_GRAPHS = (*GRAPHS, "synthetic_20000", *(f"{graph}{_ONLINE}" for graph in GRAPHS))
 PEERS: dict[str, graph_peers.Peer] = {
     "gtsam_gnc": graph_peers.gnc,
     "gtsam_lm_cauchy": graph_peers.cauchy,
