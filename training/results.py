@@ -154,9 +154,6 @@ def summary(
         "seeds": list(range(arguments.seeds)),
         "tables": {name: tables.table_json(table, prefixes, steps, world) for name, table in evaluations.items()},
         "paired": {name: tables.paired_json(table, steps, world) for name, table in evaluations.items()},
-        "local_bias_deg": {
-            name: tables.heading_bias_json(arrays["relative"], arrays["truth"]) for name, arrays in stores.items()
-        },
         "path_m": {
             name: tables.path_json(arrays["truth"], sorted({*prefixes, steps})) for name, arrays in stores.items()
         },

@@ -32,7 +32,7 @@ def page(result: dict[str, Any], images: dict[str, str], world: World) -> str:
     ]
     for name, table in result["tables"].items():
         length = f"{result['path_m'][name][str(result['steps'])]:.0f} m driven on average"
-        parts += [f"## Table `{name}`", f"{length}.", _table(table, metrics), _bias(result, name)]
+        parts += [f"## Table `{name}`", f"{length}.", _table(table, metrics)]
         parts += ["### Differences on the same trajectories", _pairs(result["paired"][name], metrics[0])]
         parts += [
             f"### {metrics[0].title} ({metrics[0].unit}) after fewer steps",
@@ -61,12 +61,6 @@ def _table(table: dict[str, Any], metrics: Sequence[Metric]) -> str:
 
     header = ["Row", "", *(f"{metric.title}, {metric.unit}" for metric in metrics)]
     return markdown(header, (cells(row, entry) for row, entry in table.items()))
-
-
-def _bias(result: dict[str, Any], name: str) -> str:
-    bias = result["local_bias_deg"][name]
-    shown = with_interval(bias, signed(4)).replace(" [", " deg [")
-    return f"Mean heading error of a step of the local network: {shown}."
 
 
 def _pairs(pairs: dict[str, Any], metric: Metric) -> str:

@@ -4,9 +4,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
-import torch
 
-from ngo_estimator.geometry import se2
 from training.data.worlds import World
 from training.scoring.prefix_errors import stacked
 from training.scoring.scores import METRICS
@@ -72,13 +70,6 @@ def paired_json(table: Table, steps: int, world: World) -> dict[str, Any]:
         for row, other in PAIRS
         if row in table and other in table
     }
-
-
-def heading_bias_json(relative: np.ndarray, truth: np.ndarray) -> dict[str, Any]:
-    """Mean heading error of a step (deg) of odometry ``(trajectories, steps, 3)`` against true poses."""
-    true_steps = se2.g2r(torch.from_numpy(np.array(truth, dtype=np.float64)))
-    error = se2.wrap(torch.from_numpy(np.array(relative[..., 2], dtype=np.float64)) - true_steps[..., 2])
-    return mean_interval(np.degrees(error.numpy().mean(axis=1))).as_json()
 
 
 def path_json(truth: np.ndarray, prefixes: Sequence[int]) -> dict[str, float]:

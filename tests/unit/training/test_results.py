@@ -47,16 +47,6 @@ def test_rows_are_compared_where_both_are() -> None:
     assert found["gtsam_vs_local"]["position_rmse"]["difference"]["ci95"][1] < 0.0
 
 
-def test_a_constant_turn_is_found_as_heading_bias() -> None:
-    truth = np.zeros((3, 50, 3))
-    truth[..., 0] = np.arange(1, 51)
-    relative = np.zeros((3, 50, 3), np.float32)
-    relative[..., 2] = np.radians([0.01, 0.02, 0.03])[:, None]
-    bias = tables.heading_bias_json(relative, truth)
-    assert bias["mean"] == pytest.approx(0.02, rel=1e-5)
-    assert 0.0099 < bias["ci95"][0] < bias["ci95"][1] < 0.0301
-
-
 @pytest.mark.parametrize("index", [1, GROUP + 1])
 def test_figures_show_the_maze_that_was_driven_through(index: int) -> None:
     seeds = WORLD.table_seeds("cycles", "validation")
