@@ -54,7 +54,7 @@ def relation_errors(stamps: list[int], poses: Array) -> tuple[float, float]:
     return float(mean[0]), float(mean[1])
 
 
-_MISSED = pytest.mark.xfail(reason="0.088 to 0.115 m, by changes of the ranges of up to 1 mm")
+_MISSED = pytest.mark.xfail(strict=False, reason="0.07 to 0.12 m, by changes of the ranges of up to 1 mm")
 
 
 @pytest.mark.parametrize("with_wheels", [pytest.param(True, marks=_MISSED), False])
