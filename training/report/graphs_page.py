@@ -23,8 +23,8 @@ changed. `hard_` graphs have a poor odometry, and twice as many loops as `synthe
 where the poses fit it within its stated threshold. `cheapest` is the share of graphs where the truncated cost of what
 was found is not above that of the right loops' solution. A graph that is not solved there has a cheaper wrong solution:
 no search for a lower cost would find the right one. `graphs` in the JSON says how many graphs a row has: slow peers
-have one of Manhattan. Four designs of networks that judge loops or solutions were tried: one solves more graphs, in 2
-to 2.8 times the time ([notebook](notebook.md#pose-graphs-with-wrong-loops)).
+have one of Manhattan, not three. Four designs of networks that judge loops or solutions were tried: one solves more
+graphs, in 2 to 2.8 times the time ([notebook](notebook.md#pose-graphs-with-wrong-loops)).
 
 | kind | wrong loops |
 |---|---|
