@@ -39,10 +39,8 @@ _LEAST_WALLS, _MOST_MEAN, _OWN_TIMES = 8, 0.02, 4.5
 """A claim needs so many different walls. The way may look through so much of the walls in the mean, and so many times
 as much as the place's own scans do: where people walk, and doors and furniture move, a map contradicts itself."""
 
-_CLEAR_MEAN, _CLEAR_THROUGH, _FEWEST_WALLS = 0.07, 0.15, 4
-"""A way that was just driven looks through so much of the walls of a good map at most in the mean, and so much in each
-part: doors, people and furniture. The less it does, the fewer walls tell places apart: so few where it looks through
-none."""
+_FEWEST_WALLS = 4
+"""So many walls tell places apart where nothing is looked through, and the more is, the more walls it takes."""
 
 
 @dataclass(frozen=True)
@@ -64,9 +62,14 @@ class PlaceEvidence:
     own: float = 0.0
 
     @property
+    def _most(self) -> float:
+        """Of ``mean`` at the place of the way."""
+        return _MOST_MEAN + _OWN_TIMES * self.own
+
+    @property
     def suffices(self) -> bool:
         """Whether a stretch of the way and a place have enough in common, and contradict each other little."""
-        return self.walls >= _LEAST_WALLS and self.mean <= _MOST_MEAN + _OWN_TIMES * self.own
+        return self.walls >= _LEAST_WALLS and self.mean <= self._most
 
     def rivals(self, better: "PlaceEvidence") -> bool:
         """Whether this is nearly as likely as a better place: the way looks through less than twice as much."""
@@ -74,9 +77,9 @@ class PlaceEvidence:
 
     @property
     def is_clear(self) -> bool:
-        """Whether they do not even contradict each other as little as a map may that is still being made."""
-        needed = _FEWEST_WALLS + (_LEAST_WALLS - _FEWEST_WALLS) * self.mean / _CLEAR_MEAN
-        return bool(self.walls >= needed and self.mean <= _CLEAR_MEAN and self.through <= _CLEAR_THROUGH)
+        """Whether they have enough in common for how little they contradict each other."""
+        needed = _FEWEST_WALLS + (_LEAST_WALLS - _FEWEST_WALLS) * self.mean / self._most
+        return bool(self.walls >= needed and self.mean <= self._most)
 
 
 NO_EVIDENCE = PlaceEvidence(0, 0.0, 0)
