@@ -69,3 +69,13 @@ def test_odometry_that_ends_is_said_and_steps_go_on_without() -> None:
     assert all(each.tf_odom_known for each in found[1:19]), "the first one came before the odometry"
     assert not any(each.tf_odom_known for each in found[20:])
     assert len(found) == 80 and "older" in on_tf.problem()
+
+
+def test_it_is_said_while_scans_wait_for_their_mounting() -> None:
+    buffer = TransformBuffer()
+    on_tf = OdometryOnTf(buffer, "odom", "base_link")
+    stamps_ns = [100 * S + k * STEP_NS for k in range(16)]
+    assert "no map -> odom" in on_tf.problem(stamps_ns) and not on_tf.problem(stamps_ns[:15])
+    for stamp_ns in stamps_ns[:2]:
+        buffer.add("odom", "base_link", stamp_ns, make_pose((0.0, 0.0, 0.0), (0, 0, 0, 1)), static=False)
+    assert not on_tf.problem(stamps_ns), "the first one is known"

@@ -154,7 +154,8 @@ class LidarInput:
             self._publish(step)
         for line in self._core.news():
             self._node.get_logger().info(line)
-        problem = self._on_tf.problem()
+        held = self._held if self._settings.robot_odometry == "tf" else ()
+        problem = self._on_tf.problem([scan.stamp_ns for scan in held])
         if problem and not self._said:
             self._node.get_logger().warning(problem)
         self._said = problem
@@ -236,8 +237,7 @@ class LidarInput:
             if known is None and frame not in ("", self._robot.base_frame):
                 found.append(f"no transform says where '{frame}' sits on '{self._robot.base_frame}'")
         found += self._core.problems()
-        if problem := self._on_tf.problem():
-            found.append(problem)
+        found += [self._said] if self._said else []
         return found
 
 

@@ -1,7 +1,7 @@
 """The robot's own odometry on TF at the stamps of steps: steps wait for it, what is missing is said (no ROS here)."""
 
 from collections import deque
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -70,9 +70,12 @@ class OdometryOnTf:
     def _note(self, stamp_ns: int) -> None:
         self._unknown_ns = stamp_ns if self._unknown_ns is None else min(self._unknown_ns, stamp_ns)
 
-    def problem(self) -> str:
-        """What is missing, where nothing was known for a while; else nothing."""
-        if self._unknown_ns is None or self._newest_ns - self._unknown_ns < _SAID_AFTER_NS:
+    def problem(self, held_ns: Sequence[int] = ()) -> str:
+        """What is missing, where nothing was known for a while, also at the stamps of scans that are no steps yet."""
+        since_ns, newest_ns = self._unknown_ns, self._newest_ns
+        if held_ns and self._buffer.lookup(*self._frames, held_ns[0]) is None:
+            since_ns, newest_ns = held_ns[0], held_ns[-1]
+        if since_ns is None or newest_ns - since_ns < _SAID_AFTER_NS:
             return ""
-        why = self._buffer.missing(*self._frames, self._newest_ns)
+        why = self._buffer.missing(*self._frames, newest_ns)
         return f"no map -> {self._frames[0]} for the newest scan: {why}" if why else ""
