@@ -15,7 +15,7 @@ from hypothesis.extra import numpy as arrays
 
 from ngo_recordings.calibration import calibration_of, info_topics, is_rectified
 from ngo_recordings.errors import RecordingError
-from ngo_recordings.images import COMPRESSED_TYPE, ENCODINGS, IMAGE_TYPE, SCAN_TYPE, picture, with_depth
+from ngo_recordings.images import COMPRESSED_TYPE, ENCODINGS, IMAGE_TYPE, SCAN_TYPE, depth_picture, picture, with_depth
 
 from . import messages as m
 
@@ -159,8 +159,8 @@ def test_depth_becomes_a_fourth_channel_of_colour_alone() -> None:
         with_depth(RGB, depth[:2], "/depth")
     with pytest.raises(RecordingError, match="goes with colour pictures"):
         with_depth(RGB[..., :1], depth, "/depth")
-    with pytest.raises(RecordingError, match="is no depth; expected an Image of 16UC1 or 32FC1"):
-        with_depth(RGB, RGB, "/depth")
+    with pytest.raises(RecordingError, match="are 'rgb8'; expected depth, 16UC1 or 32FC1"):
+        depth_picture(m.image(0, RGB, "rgb8"), "/depth")
 
 
 MATRIX = [400.0, 0.0, 320.0, 0.0, 400.0, 240.0, 0.0, 0.0, 1.0]

@@ -110,7 +110,7 @@ def depth_image(encoding: str) -> tuple[Any, Any]:
     up = (59.5 - np.arange(height))[:, None] / focal + np.zeros(width)
     azimuths, elevations = np.arctan(left) + np.zeros((height, 1)), np.arctan(up / np.hypot(1.0, left))
     depth = in_room(azimuths.ravel(), elevations.ravel())[:, 0].reshape(height, width, 1)
-    pixels = (depth * 1000.0).round().astype("u2") if encoding == "16UC1" else depth.astype("f4")
+    pixels = (depth * 1000.0).round().astype("u2") if encoding != "32FC1" else depth.astype("f4")
     image = m.image(BEGIN_NS, pixels, encoding)
     image.header.frame_id = "camera_optical_frame"
     k = np.array((focal, 0.0, 79.5, 0.0, focal, 59.5, 0.0, 0.0, 1.0))
@@ -119,7 +119,7 @@ def depth_image(encoding: str) -> tuple[Any, Any]:
     return image, m.make("sensor_msgs/msg/CameraInfo", m.header(BEGIN_NS), height, width, *rest)
 
 
-@pytest.mark.parametrize("encoding", ["16UC1", "32FC1"])
+@pytest.mark.parametrize("encoding", ["16UC1", "mono16", "32FC1"])
 def test_depth_is_a_scan_ahead_as_far_as_depth_is_exact(encoding: str) -> None:
     made = depth_scan(*depth_image(encoding), "/depth")
     seen = np.isfinite(made.ranges)
@@ -130,7 +130,8 @@ def test_depth_is_a_scan_ahead_as_far_as_depth_is_exact(encoding: str) -> None:
 def test_depth_as_numbers_in_millimetres_is_taken_so() -> None:
     image, info = depth_image("32FC1")
     image.data = (1000.0 * image.data.view("f4")).view(np.uint8)
-    assert off_walls(depth_scan(image, info, "/depth")).max() < 0.03
+    made = depth_scan(image, info, "/depth")
+    assert off_walls(made).max() < 0.03 and "in millimetres" in made.note
 
 
 @pytest.mark.parametrize("change", ["full", "binned", "part", "no size", "projection"])
@@ -154,7 +155,17 @@ def test_a_camera_is_described_whatever_its_images_show_of_it(change: str) -> No
 @pytest.mark.parametrize("kind", ["i2", "f4"])
 def test_clouds_in_millimetres_are_taken_so(kind: str) -> None:
     made = cloud_scan(m.cloud(BEGIN_NS, fields(1000.0 * turning()[0], kind)), "/points")
+    assert np.isfinite(made.ranges).sum() > 1300 and off_walls(made).max() < 0.02 and "in millimetres" in made.note
+
+
+@pytest.mark.parametrize("frame", ["robot1/base_link", "lidar"])
+def test_points_in_the_robots_own_frame_have_the_floor_at_zero(frame: str) -> None:
+    on_robot = frame != "lidar"
+    message = m.cloud(BEGIN_NS, fields(turning()[0] + (0.0, 0.0, HEIGHT_M * on_robot)))
+    message.header.frame_id = frame
+    made = cloud_scan(message, "/points")
     assert np.isfinite(made.ranges).sum() > 1300 and off_walls(made).max() < 0.02
+    assert ("those at 0.1 to 0.5 m count" in made.note) == on_robot
 
 
 def test_a_cloud_of_a_flat_lidar_needs_no_z() -> None:

@@ -19,7 +19,7 @@ from ngo_recordings.association import (
     header_stamp_ns,
 )
 from ngo_recordings.errors import RecordingError
-from ngo_recordings.images import IMAGE_TYPE, ScanGeometry, picture, with_depth
+from ngo_recordings.images import ScanGeometry, depth_picture, picture, with_depth
 from ngo_recordings.poses import read_tum
 from ngo_recordings.recording import Message, Recording
 from ngo_recordings.topics import TF_TYPE, RecordingTopics
@@ -185,7 +185,7 @@ class _Frames:
             if depth is None:
                 self._skipped[NO_DEPTH] += 1
                 return None
-            image = with_depth(image, picture(depth, IMAGE_TYPE, self._topics.depth)[0], self._topics.depth)
+            image = with_depth(image, depth_picture(depth, self._topics.depth), self._topics.depth)
         if scan is None and self._shape not in (None, image.shape):
             raise RecordingError(
                 f"the image of {message.topic} at {stamp_ns / 1e9:.9f} s is {image.shape} after images of "

@@ -83,11 +83,24 @@ def picture(
         return _scan(message, topic)
     if type_name == COMPRESSED_TYPE:
         return _compressed(message, topic, largest), None
-    return _raw(message, topic), None
+    return _raw(message, topic, message.encoding), None
 
 
-def _raw(message: Any, topic: str) -> np.ndarray:
-    encoding = _ENCODINGS.get(message.encoding)
+def depth_picture(message: Any, topic: str) -> np.ndarray:
+    """The depth in an Image ``(height, width, 1)``, m: float32, +inf where there is none; mono16 is 16UC1.
+
+    Raises:
+        RecordingError: it is no depth, or data of another size than the message says.
+    """
+    encoding = "16UC1" if message.encoding == "mono16" else message.encoding
+    if encoding not in DEPTH_ENCODINGS:
+        expected = " or ".join(DEPTH_ENCODINGS)
+        raise RecordingError(f"images of {topic} are {encoding!r}; expected depth, {expected}")
+    return _raw(message, topic, encoding)
+
+
+def _raw(message: Any, topic: str, name: str) -> np.ndarray:
+    encoding = _ENCODINGS.get(name)
     if encoding is None:
         raise RecordingError(
             f"images of {topic} are {message.encoding!r}; supported: {', '.join(ENCODINGS)}, and jpeg or png in "
@@ -180,8 +193,6 @@ def with_depth(image: np.ndarray, depth: np.ndarray, topic: str) -> np.ndarray:
     """
     if image.dtype != np.uint8 or image.shape[2] != 3:
         raise RecordingError(f"depth {topic} goes with colour pictures; these have {image.shape[2]} x {image.dtype}")
-    if depth.dtype != np.float32 or depth.shape[2] != 1:
-        raise RecordingError(f"{topic} is no depth; expected an Image of {' or '.join(DEPTH_ENCODINGS)}")
     if depth.shape[:2] != image.shape[:2]:
         raise RecordingError(
             f"depth {topic} is {depth.shape[1]} x {depth.shape[0]} and the pictures are {image.shape[1]} x "

@@ -30,7 +30,7 @@ class LidarScan:
     is negative where rays run clockwise. ranges ``(rays,)``: float32, m, as recorded, so holes, NaN and values out of
     range_min and range_max (m) are there. time_increment: from ray to ray, s, 0 where unknown. offsets_s ``(rays,)``:
     when each ray was measured, after the stamp, where that is not even; None: as time_increment says. topic: where it
-    came from.
+    came from. note: what its message says otherwise, in words.
     """
 
     stamp_ns: int
@@ -43,6 +43,7 @@ class LidarScan:
     frame_id: str
     offsets_s: np.ndarray | None = None
     topic: str = ""
+    note: str = ""
 
     @property
     def angles(self) -> np.ndarray:

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from dataclasses import replace
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
@@ -14,17 +15,18 @@ import numpy as np
 
 from ngo_recordings.association import header_stamp_ns
 from ngo_recordings.errors import RecordingError
-from ngo_recordings.images import CLOUD_TYPE, IMAGE_TYPE, SCAN_TYPE, picture
+from ngo_recordings.images import CLOUD_TYPE, IMAGE_TYPE, SCAN_TYPE, depth_picture
 from ngo_recordings.laser_scan import LidarScan, scan_of
 
 if TYPE_CHECKING:  # live nodes need no files
     from ngo_recordings.recording import Recording
 
 _RAYS = 1440
-_LOW_M, _HIGH_M = -0.2, 0.2
+_BAND_M, _BAND_ON_ROBOT_M = (-0.2, 0.2), (0.1, 0.5)
 _HIGH_SHARE = 0.03
 """Points so far below and above the sensor count, and above it this share of their range: rings spread. Nothing below,
-where the floor is."""
+where the floor is. Points that are given in the robot's own frame have the floor at about 0."""
+_ROBOT_FRAMES = ("base_link", "base_footprint", "base")
 _SURFACE_M = 0.1
 """Points of a ray so far behind its nearest one are of the same surface."""
 _NEAREST_M, _FARTHEST_M = 0.05, 1000.0
@@ -36,6 +38,7 @@ _SANE_M, _MOSTLY = (1e-5, 1e5), 0.8
 
 _FAR = 100.0
 """No sensor of a robot sees half of its points so far away (m)."""
+_IN_MM = "its distances are in millimetres: taken so"
 _SAME_VIEW = 0.03
 """Widths and heights of two images of one view have the same ratio, but for pixels that were rounded off."""
 
@@ -66,14 +69,21 @@ def cloud_scan(message: Any, topic: str) -> LidarScan:
         raise RecordingError(f"a cloud of {topic} has the fields {', '.join(names) or 'none'}; expected x, y and z")
     flat = np.zeros(len(values))  # a lidar of one plane may leave z out
     points = np.stack([values[name].astype(np.float64) if name in names else flat for name in "xyz"], axis=-1)
-    points = _metres(points)
-    frame = str(message.header.frame_id).strip("/")
+    unit_m, frame = _unit_m(points), str(message.header.frame_id).strip("/")
+    points *= unit_m
+    notes = [_IN_MM] if unit_m != 1.0 else []
     if is_optical(frame):
         points = points[:, (2, 0, 1)] * (1.0, -1.0, -1.0)
+    if frame.rpartition("/")[2] in _ROBOT_FRAMES:
+        low, high = _BAND_ON_ROBOT_M
+        notes.append(
+            f"its points are given in {frame}, not in the sensor's frame: those at {low:g} to {high:g} m count"
+        )
+        points[:, 2] -= low - _BAND_M[0]
     stamp_ns = header_stamp_ns(message)
     time = next((name for name in _TIMES if name in names), None)
     offsets_s = None if time is None else _offsets_s(values[time].astype(np.float64), stamp_ns * 1e-9)
-    return _scan(points, offsets_s, _FARTHEST_M, stamp_ns, frame, topic)
+    return replace(_scan(points, offsets_s, _FARTHEST_M, stamp_ns, frame, topic), note="; ".join(notes))
 
 
 def depth_scan(message: Any, info: Any, topic: str) -> LidarScan:
@@ -84,9 +94,7 @@ def depth_scan(message: Any, info: Any, topic: str) -> LidarScan:
     """
     if info is None:
         raise RecordingError(f"no CameraInfo came on {info_topic(topic)}, which says how {topic} was taken")
-    depth, _ = picture(message, IMAGE_TYPE, topic)
-    if depth.dtype != np.float32 or depth.shape[2] != 1:
-        raise RecordingError(f"images of {topic} are {message.encoding!r}; expected depth, 16UC1 or 32FC1")
+    depth = depth_picture(message, topic)
     height, width = depth.shape[:2]
     matrix = _matrix_of(info, width, height)
     if matrix is None:
@@ -96,13 +104,15 @@ def depth_scan(message: Any, info: Any, topic: str) -> LidarScan:
             f"an image of {topic} is {width} x {height}; its CameraInfo is of {info.width} x {info.height}, its focal "
             f"length {focal}"
         )
-    ahead = _metres(depth[..., 0].astype(np.float64))
+    unit_m = _unit_m(depth)
+    ahead = unit_m * depth[..., 0].astype(np.float64)
     ahead[~(ahead < _FARTHEST_DEPTH_M)] = np.nan
     left = (matrix[2] - np.arange(width)) / matrix[0] * ahead
     up = ((matrix[5] - np.arange(height)) / matrix[4])[:, None] * ahead
     points = np.stack((ahead, left, up), axis=-1).reshape(-1, 3)
     frame = str(message.header.frame_id).strip("/")
-    return _scan(points, None, _FARTHEST_DEPTH_M, header_stamp_ns(message), frame, topic)
+    found = _scan(points, None, _FARTHEST_DEPTH_M, header_stamp_ns(message), frame, topic)
+    return replace(found, note=_IN_MM if unit_m != 1.0 else "")
 
 
 def camera_matrix(info: Any) -> np.ndarray:
@@ -180,10 +190,10 @@ def _records(message: Any, topic: str) -> np.ndarray:
     return np.ndarray((height, width), kind, data, 0, (row, step)).reshape(-1)
 
 
-def _metres(values: np.ndarray) -> np.ndarray:
-    """Distances or coordinates as they should be: a driver may give them in millimetres."""
+def _unit_m(values: np.ndarray) -> float:
+    """The unit of distances or coordinates, m: a driver may give them in millimetres."""
     sizes = np.abs(values[np.isfinite(values) & (values != 0.0)])
-    return 0.001 * values if sizes.size and np.median(sizes) > _FAR else values
+    return 0.001 if sizes.size and np.median(sizes) > _FAR else 1.0
 
 
 def _sane(values: np.ndarray) -> float:
@@ -212,8 +222,8 @@ def _scan(
 ) -> LidarScan:
     """The nearest surface at each angle; angles at which no point was seen say nothing."""
     reach = np.hypot(points[:, 0], points[:, 1])
-    high = np.maximum(_HIGH_M, _HIGH_SHARE * reach)
-    counts = (reach > _NEAREST_M) & (reach < farthest_m) & (points[:, 2] >= _LOW_M) & (points[:, 2] <= high)
+    high = np.maximum(_BAND_M[1], _HIGH_SHARE * reach)
+    counts = (reach > _NEAREST_M) & (reach < farthest_m) & (points[:, 2] >= _BAND_M[0]) & (points[:, 2] <= high)
     index = np.flatnonzero(counts)
     angle = np.arctan2(points[index, 1], points[index, 0])
     step = math.tau / _RAYS

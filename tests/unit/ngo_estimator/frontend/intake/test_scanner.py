@@ -110,7 +110,15 @@ def test_limits_count_where_nothing_comes_back_or_much_is_within_them(share: flo
         ranges = np.where(noise.random(RAYS) < share, noise.uniform(65.0, 66.0, RAYS), scan.ranges).astype(np.float32)
         found = scanner.correct(replace(scan, ranges=ranges, range_max=limit_m), 0.0)
         assert found is not None and 0.0 < found.range_max <= limit_m
-    assert (scan.ranges > 2.0).mean() > 0.5 and scanner.remarks("laser") == []
+    told = [] if share else ["laser: most of what it measures is beyond its range_max: not used"]
+    assert (scan.ranges > 2.0).mean() > 0.5 and scanner.remarks("laser") == told
+
+
+def test_what_is_said_of_a_scan_is_told_once() -> None:
+    scanner = Scanner()
+    for scan in drive(3):
+        scanner.correct(replace(scan, note="its distances are in millimetres: taken so"), 0.0)
+    assert scanner.remarks("points") == ["points: its distances are in millimetres: taken so"]
 
 
 def test_limits_that_are_not_used_stay_so_and_one_scan_is_not_enough() -> None:

@@ -194,6 +194,18 @@ def test_wheels_without_a_heading_are_left_out() -> None:
     assert [line.partition(":")[2] for line in run.remarks()] == [" they are left out"]
 
 
+@pytest.mark.parametrize("y", [1.0, -1.0])
+def test_wheels_whose_y_has_the_other_sign_measure_no_sweep(y: float, monkeypatch: pytest.MonkeyPatch) -> None:
+    begin, given = np.array((0.0, 0.0, 0.7)), []
+    made = [
+        replace(r, pose_xyyaw=compose(begin, r.pose_xyyaw) * (1.0, y, 1.0)) if isinstance(r, WheelPose) else r
+        for r in SWEPT
+    ]
+    monkeypatch.setattr(sweep.MeasuredSweep, "observe", lambda _, *taken: given.append(taken[2] is not None))
+    run_over(made, drive(90))
+    assert np.mean(given) < 0.4 if y < 0.0 else np.mean(given) > 0.9
+
+
 def test_wheels_that_have_nothing_to_do_with_the_scans_are_left_out() -> None:
     made, other = records(STILL), records(drive(240)[::-1].copy())
     wheels = [record for record in other if isinstance(record, WheelPose)]

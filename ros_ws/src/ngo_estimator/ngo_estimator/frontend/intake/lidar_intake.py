@@ -1,5 +1,6 @@
 """What stands before the front end of a lidar: scans as they should be, of all scanners together (no ROS here)."""
 
+import math
 from collections import deque
 from collections.abc import Callable, Iterator
 from dataclasses import replace
@@ -21,6 +22,9 @@ from ngo_recordings.scan_stream import LidarScan, WheelPose
 
 _NEWS_STEPS = 20
 """Steps after which there may be news."""
+
+_OTHER_WAY, _OTHER_WAY_M = 0.5, 0.03
+"""Ways that are apart by more than this share of the longer one, and by so much, are not the same."""
 
 MountingOf = Callable[[str], Mounting | None]
 """Where the scanner of a frame sits; None where it is not known."""
@@ -191,7 +195,7 @@ class LidarIntake:
             begin_ns, end_ns = step.from_stamp_ns - early_ns, step.stamp_ns - early_ns
             by_wheels = counted * self._clock.truth.turn_scale
             self._imu.observe(begin_ns, end_ns, float(step.relative_xyyaw[2]), by_wheels)
-        motion = None if self._clock.truth.useless else motion
+        motion = None if self._clock.truth.useless or _contradicts(motion, step.relative_xyyaw) else motion
         for name, scanner in self._scanners.items():
             if self._turns.alone and (mounting := self._mountings.get(name)) is not None:
                 scanner.sweep.observe(step.stamp_ns, step.relative_xyyaw, motion, elapsed_s, mounting)
@@ -235,6 +239,14 @@ class LidarIntake:
         """A line for each scanner that is missing."""
         lines = [f"{name} is left out: its mounting is not known" for name, at in self._mountings.items() if at is None]
         return [*lines, *(f"nothing more comes from {name}" for name in self._turns.silent())]
+
+
+def _contradicts(motion: Array | None, step: Array) -> bool:
+    """Whether the motion ``(3,)`` by the wheels is another one than that by the scans, whatever their sweep."""
+    if motion is None:
+        return False
+    way = max(math.hypot(motion[0], motion[1]), math.hypot(step[0], step[1]))
+    return math.hypot(motion[0] - step[0], motion[1] - step[1]) > max(_OTHER_WAY * way, _OTHER_WAY_M)
 
 
 def _words(line: str) -> str:

@@ -37,7 +37,7 @@ class RangeUnit:
 
     def __init__(self) -> None:
         self._unit_m = 1.0
-        self._doubted = self._beyond = 0
+        self._doubted = self._beyond = self._cropped = 0
 
     def metres(self, scan: LidarScan) -> LidarScan:
         """The scan in metres, also its limits where these are not."""
@@ -54,6 +54,8 @@ class RangeUnit:
             if self._beyond < _SCANS:
                 beyond = _LEAST_LIMIT_M < low > far > 0.0 or 0.0 < high < near < far / _SPREAD
                 self._beyond = self._beyond + 1 if beyond else 0
+            if self._cropped < _SCANS:
+                self._cropped = self._cropped + 1 if 0.0 < high < middle < far / _SPREAD else 0
             return scan if self._beyond < _SCANS else replace(scan, range_min=0.0, range_max=0.0)
         low = self._unit_m * low if low > _LEAST_LIMIT_M else low
         high = self._unit_m * high if high > max(near, _FAR) else high
@@ -63,7 +65,10 @@ class RangeUnit:
         """In words; nothing where ranges and limits are in metres."""
         if self._unit_m < 1.0:
             return f"its ranges are in {_NAMES[self._unit_m]}: taken so"
-        return "nearly all it measures is beyond its limits: they are not used" if self._beyond >= _SCANS else ""
+        if self._beyond >= _SCANS:
+            return "nearly all it measures is beyond its limits: they are not used"
+        cropped = self._cropped >= _SCANS
+        return "most of what it measures is beyond its range_max: not used" if cropped else ""
 
 
 def _nearly_all(ranges: np.ndarray) -> tuple[float, float, float]:

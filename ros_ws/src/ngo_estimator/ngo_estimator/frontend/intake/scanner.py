@@ -21,6 +21,7 @@ class Scanner:
         self._unit = RangeUnit()
         self._no_return = NoReturnValues()
         self._own = OwnReturns()
+        self._notes: dict[str, None] = {}  # what its messages say otherwise, each once
 
     def correct(
         self, scan: LidarScan, min_range_m: float, driven: MotionSince = lambda from_ns: None
@@ -29,6 +30,7 @@ class Scanner:
         though the robot has ``driven``, or of another scanner."""
         if not self._single.counts(scan, driven):
             return None
+        self._notes |= {scan.note: None} if scan.note else {}
         scan = self._unit.metres(scan)
         if scan.range_min < min_range_m:
             scan = replace(scan, range_min=min_range_m)
@@ -54,7 +56,7 @@ class Scanner:
         if self._no_return.values:
             values = ", ".join(f"{value:g}" for value in self._no_return.values)
             lines.append(f"{name} says {values} m where nothing came back: taken so")
-        told = self._unit.remark(), *self._single.remarks(), self.sweep.remark()
+        told = *self._notes, self._unit.remark(), *self._single.remarks(), self.sweep.remark()
         lines += [f"{name}: {line}" for line in told if line]
         if self._own.rays:
             lines.append(f"{self._own.rays} rays of {name} see the robot itself: left out")
