@@ -11,6 +11,7 @@ _TITLES = {
     "particle_filter": "`particle_filter`: AMCL's model on the map's ranges, starting anywhere in free space",
     "oracle_place": "`oracle_place`: the truly nearest frame of the map is given, and measured",
 }
+"""The last two are no longer measured; they stay where the stored numbers have them."""
 _COLUMNS = (
     Column("starts", "Starts", lambda value: f"{value:.0f}"),
     Column("success", "Success (%)", short, 100.0),
