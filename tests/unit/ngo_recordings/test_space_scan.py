@@ -134,7 +134,23 @@ def test_depth_as_numbers_in_millimetres_is_taken_so() -> None:
     assert off_walls(made).max() < 0.03 and "in millimetres" in made.note
 
 
-@pytest.mark.parametrize("change", ["full", "binned", "part", "no size", "projection"])
+@pytest.mark.parametrize("sky", [65504.0, 1000.0])
+def test_sky_with_a_number_is_far_away_and_changes_no_unit(sky: float) -> None:
+    image, info = depth_image("32FC1")
+    depth = image.data.view("f4").reshape(120, 160)
+    depth[:55], depth[:, :20] = sky, sky
+    made = depth_scan(image, info, "/depth")
+    assert (depth == sky).mean() > 0.5 and np.isfinite(made.ranges).sum() > 100 and off_walls(made).max() < 0.03
+
+
+def test_a_cloud_in_a_field_is_in_metres() -> None:
+    azimuths = np.radians(np.arange(-180.0, 180.0, 0.2))
+    reach = 260.0 + 160.0 * np.sin(2.0 * azimuths)
+    points = np.stack((reach * np.cos(azimuths), reach * np.sin(azimuths), 0.0 * azimuths), axis=-1)
+    assert np.nanmin(cloud_scan(m.cloud(BEGIN_NS, fields(points)), "/points").ranges) == pytest.approx(100.0, abs=1.0)
+
+
+@pytest.mark.parametrize("change", ["full", "binned", "part", "cut", "no size", "projection"])
 def test_a_camera_is_described_whatever_its_images_show_of_it(change: str) -> None:
     """Full pictures of the sensor are twice as large, a part of it lacks a border, and drivers forget half."""
     image, info = depth_image("16UC1")
@@ -144,6 +160,8 @@ def test_a_camera_is_described_whatever_its_images_show_of_it(change: str) -> No
         info.binning_x = info.binning_y = 2 if change == "binned" else 0
     elif change == "part":
         info.width, info.height, info.k = 200, 140, info.k + (0.0, 0.0, 30.0, 0.0, 0.0, 10.0, 0.0, 0.0, 0.0)
+        info.roi = m.make("sensor_msgs/msg/RegionOfInterest", 30, 10, 120, 160, False)
+    elif change == "cut":  # all numbers are those of the part
         info.roi = m.make("sensor_msgs/msg/RegionOfInterest", 30, 10, 120, 160, False)
     elif change == "no size":
         info.width = info.height = 0

@@ -12,9 +12,6 @@ from ngo_recordings.association import header_stamp_ns
 _MOVES = (0.05, 0.05)
 """Way and turn (m, rad) by the velocity, after which the velocity counts if the pose has not moved."""
 
-_FASTEST_RPS, _OFTEN = 12.0, 3
-"""No robot turns faster; a driver that says so as often gives degrees."""
-
 _LONGEST_S = 1.0
 """Between two messages whose velocities are summed up."""
 
@@ -29,7 +26,6 @@ class OdometryPoses:
         # Whether the place and the direction were others than the first ones: as given, and by velocities.
         self._moved, self._drove = np.zeros(2, np.bool_), np.zeros(2, np.bool_)
         self._pose = np.zeros(3)
-        self._too_fast = 0
         self._last: tuple[int, np.ndarray] | None = None
 
     def read(self, message: Any) -> np.ndarray | None:
@@ -42,9 +38,6 @@ class OdometryPoses:
         twist = np.array([linear.x, linear.y, angular.z])
         given = planar_pose(message.pose.pose.position, message.pose.pose.orientation)
         if np.isfinite(twist).all():
-            self._too_fast += abs(twist[2]) > _FASTEST_RPS
-            if self._too_fast >= _OFTEN:
-                twist[2] = math.radians(twist[2])
             self._sum_up(stamp_ns, twist)
             self._judge(given)
         return self._pose.copy() if self.from_velocity else given

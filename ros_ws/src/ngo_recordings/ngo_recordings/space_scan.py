@@ -36,8 +36,10 @@ _FARTHEST_DEPTH_M = 5.0
 _SANE_M, _MOSTLY = (1e-5, 1e5), 0.8
 """Coordinates are within these, mostly; else the driver says the wrong order of bytes, which PCL does not read."""
 
-_FAR = 100.0
-"""No sensor of a robot sees half of its points so far away (m)."""
+_FAR, _NEARLY_ALL = 200.0, 0.1
+"""No sensor of a robot sees all but this share of its points so far away (m)."""
+_FEWEST, _ALIKE = 20, 0.999
+"""Fewer tell no unit, and those within this of the farthest one say that nothing came back."""
 _IN_MM = "its distances are in millimetres: taken so"
 _SAME_VIEW = 0.03
 """Widths and heights of two images of one view have the same ratio, but for pixels that were rounded off."""
@@ -69,7 +71,7 @@ def cloud_scan(message: Any, topic: str) -> LidarScan:
         raise RecordingError(f"a cloud of {topic} has the fields {', '.join(names) or 'none'}; expected x, y and z")
     flat = np.zeros(len(values))  # a lidar of one plane may leave z out
     points = np.stack([values[name].astype(np.float64) if name in names else flat for name in "xyz"], axis=-1)
-    unit_m, frame = _unit_m(points), str(message.header.frame_id).strip("/")
+    unit_m, frame = _unit_m(np.linalg.norm(points, axis=1)), str(message.header.frame_id).strip("/")
     points *= unit_m
     notes = [_IN_MM] if unit_m != 1.0 else []
     if is_optical(frame):
@@ -134,7 +136,9 @@ def _matrix_of(info: Any, width: int, height: int) -> np.ndarray | None:
         return None
     whole, corner = (info.width or 2.0 * matrix[2] + 1.0, info.height or 2.0 * matrix[5] + 1.0), (0, 0)
     roi = getattr(info, "roi", None)
-    if roi is not None and roi.width > 0 and roi.height > 0:
+    # Where it cannot lie in such a picture, the numbers are those of the part already.
+    size = info.width or math.inf, info.height or math.inf
+    if roi is not None and 0 < roi.width <= size[0] - roi.x_offset and 0 < roi.height <= size[1] - roi.y_offset:
         whole, corner = (roi.width, roi.height), (roi.x_offset, roi.y_offset)
     across, down = width / whole[0], height / whole[1]
     if abs(across / down - 1.0) > _SAME_VIEW:
@@ -191,9 +195,10 @@ def _records(message: Any, topic: str) -> np.ndarray:
 
 
 def _unit_m(values: np.ndarray) -> float:
-    """The unit of distances or coordinates, m: a driver may give them in millimetres."""
-    sizes = np.abs(values[np.isfinite(values) & (values != 0.0)])
-    return 0.001 if sizes.size and np.median(sizes) > _FAR else 1.0
+    """The unit of distances, m: a driver may give them in millimetres."""
+    seen = values[np.isfinite(values) & (values > 0.0)]
+    seen = seen[seen < _ALIKE * seen.max(initial=0.0)]
+    return 0.001 if len(seen) >= _FEWEST and np.quantile(seen, _NEARLY_ALL) > _FAR else 1.0
 
 
 def _sane(values: np.ndarray) -> float:

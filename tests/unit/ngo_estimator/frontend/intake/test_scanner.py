@@ -93,6 +93,15 @@ def test_ranges_in_centimetres_are_told_and_scaled(limits_m: tuple[float, float]
     assert scanner.remarks("laser") == ["laser: its ranges are in centimetres: taken so"]
 
 
+@pytest.mark.parametrize("limits_m", [(0.1, math.inf), (0.1, 1000.0), (0.05, 1000.0), (1.5, 300.0), (2.0, 250.0)])
+def test_a_field_is_in_metres_whatever_the_limits(limits_m: tuple[float, float]) -> None:
+    noise, scanner = np.random.default_rng(0), Scanner()
+    for scan in drive(10):
+        wide = (120.0 + 100.0 * np.sin(5.0 * scan.angles) + noise.normal(0.0, 0.02, RAYS)).astype(np.float32)
+        found = scanner.correct(replace(scan, ranges=wide, range_min=limits_m[0], range_max=limits_m[1]), 0.0)
+    assert found is not None and np.array_equal(found.ranges, wide) and not scanner.remarks("laser")
+
+
 @pytest.mark.parametrize("limits_m", [(100.0, 120.0), (50.0, 12_000.0), (15.0, 0.0), (0.1, 0.5)])
 def test_limits_that_contradict_all_ranges_are_told_and_not_used(limits_m: tuple[float, float]) -> None:
     scanner = Scanner()

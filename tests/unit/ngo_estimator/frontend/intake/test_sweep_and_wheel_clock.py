@@ -9,7 +9,7 @@ import pytest
 
 from ngo_estimator.frontend.intake import sweep
 from ngo_estimator.frontend.intake.imu_turns import ImuTurns
-from ngo_estimator.frontend.intake.wheel_clock import CorrectedWheels, WheelTruth
+from ngo_estimator.frontend.intake.wheel_clock import CorrectedWheels, WheelClock, WheelTruth
 from ngo_estimator.frontend.lidar.mixture_lidar import MixtureLidar
 from ngo_estimator.geometry.planar_motion import Array, between, compose
 from ngo_estimator.geometry.scan_points import Mounting
@@ -155,6 +155,23 @@ def test_a_driver_that_begins_anew_at_the_origin_again_and_again_made_no_step() 
     assert np.abs(lost).max() < 1e-12
     kept = [between(made[k], made[k + 10]) - between(begun[k], begun[k + 10]) for k in range(60, 80)]
     assert np.abs(kept).max() < 1e-9
+
+
+def test_an_encoder_that_dithers_at_the_origin_winds_nothing_up() -> None:
+    wheels = CorrectedWheels(ImuTurns())
+    for k in range(3001):
+        given = np.array((0.0005, 0.0, 0.0033)) * (k % 2)
+        made = wheels.add(BEGIN_NS + k * STEP_NS // 5, given, WheelTruth())[1]
+    np.testing.assert_allclose(made, 0.0, atol=1e-9)
+
+
+def test_wheels_of_a_robot_that_stands_stay_whatever_the_noise_of_scans() -> None:
+    noise, clock = np.random.default_rng(0), WheelClock()
+    for k in range(120 * 40):
+        begin_ns, end_ns = BEGIN_NS + k * STEP_NS // 4, BEGIN_NS + (k + 1) * STEP_NS // 4
+        clock.add_wheels(end_ns, np.array((0.3, 0.2, 0.1)))
+        clock.add_step(begin_ns, end_ns, np.array((0.0, 0.0, noise.normal(0.0, 0.002))))
+    assert not clock.truth.useless
 
 
 def test_odometry_in_millimetres_is_corrected_and_handed_on_as_it_was() -> None:

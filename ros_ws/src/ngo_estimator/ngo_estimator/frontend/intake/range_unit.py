@@ -1,5 +1,6 @@
 """Ranges or limits that a driver gives in another unit: no scanner sees so far, or hardly within its limits."""
 
+import math
 from dataclasses import replace
 
 import numpy as np
@@ -12,8 +13,8 @@ _FAR = 150.0
 _MIDDLE_CM = 1000.0
 """No room is so wide in centimetres: half of the ranges are below."""
 
-_MOST_LIMIT_M = 500.0
-"""No scanner sees so far in metres."""
+_CM_LIMITS = (3.0, 500.0)
+"""No scanner has a smallest range that is more in metres, together with a largest one; in centimetres it may."""
 
 _LEAST_LIMIT_M = 1.0
 """A driver's smallest range is less; a larger number is in millimetres."""
@@ -44,7 +45,8 @@ class RangeUnit:
         near, middle, far = _nearly_all(scan.ranges)
         low, high = scan.range_min, scan.range_max
         found_m = 0.001 if near > _FAR else 1.0
-        if far > _FAR >= near > 0.1 * _FAR and (low > _LEAST_LIMIT_M or high > _MOST_LIMIT_M or 0.0 < high < near):
+        others = (low > _CM_LIMITS[0] and _CM_LIMITS[1] < high < math.inf) or 0.0 < high < near
+        if others and far > _FAR >= near > 0.1 * _FAR:
             found_m = 0.01 if middle < _MIDDLE_CM else 0.001
         doubted = 0.0 < far * self._unit_m < 0.001 * _FAR if self._unit_m < 1.0 else found_m < 1.0
         self._doubted = self._doubted + 1 if doubted else 0

@@ -37,8 +37,9 @@ _CONTRADICTS = 0.3
 _MUCH_RAD = 6.0
 """Wheels that correlate less at any offset, while both turned so much, tell nothing."""
 
-_NO_TURN = 0.01
-"""Wheels that turned by less of what the scans did have no heading."""
+_NO_TURN, _NET_S = 0.01, 2.0
+"""Wheels that turned by less of what the scans did have no heading; the noise of scans cancels in what is left of turns
+after so long."""
 
 _SLIP_RPS = 0.15
 """A wheel slips where the turn of the wheels is off from that of an IMU by more (rad/s)."""
@@ -49,6 +50,9 @@ scans moved by more than this in so long, and by so many deviations. Over a long
 drift as far; in a corridor, at once."""
 
 _FROZEN_M, _FROZEN_RAD, _FROZEN_NS, _FROZEN_DEVIATIONS = 0.3, 0.3, 5_000_000_000, 3.0
+
+_BACK_M, _BACK_RAD = 0.05, 0.1
+"""A step back to the origin that is less may be that of an encoder that dithers there."""
 
 _SCALES = (0.7, 1.4)
 """Wheels within these are the front end's to judge."""
@@ -133,8 +137,8 @@ class WheelClock:
         scans, wheels = self._signals()
         if min(len(scans), len(wheels)) < _LEAST_S / _CELL_S:
             return
-        turned = np.abs(scans[:, 0]).sum(), np.abs(wheels[:, 0]).sum()
-        if turned[0] * _CELL_S > _LEAST_TURN_RAD and turned[1] < _NO_TURN * turned[0]:
+        turned = _turned(scans[:, 0]), _turned(wheels[:, 0])
+        if turned[0] > _LEAST_TURN_RAD and turned[1] < _NO_TURN * turned[0]:
             self.truth = replace(self.truth, useless=True)
             return
         lags, correlation, turns = _correlation(scans[:, 0], wheels[:, 0])
@@ -211,6 +215,12 @@ def _rates(stamps: Array, values: Array, over_s: float) -> Array:
     return np.stack(columns, axis=-1)
 
 
+def _turned(rates: Array) -> float:
+    """What is left of turns after each time, summed up (rad)."""
+    cells = round(_NET_S / _CELL_S)
+    return float(np.abs(np.add.reduceat(rates, np.arange(0, len(rates), cells))).sum() * _CELL_S)
+
+
 def _correlation(scans: Array, wheels: Array) -> tuple[Array, Array, Array]:
     """Lags ``(n,)`` (cells by which the wheels' signal begins later), the correlation at each, and the scans' turn
     (rad) in what both have in common there."""
@@ -272,7 +282,8 @@ class CorrectedWheels:
             step = between(self._raw[-1][1], pose) * (truth.way_scale, turned, truth.turn_scale)
             elapsed_s = (stamp_ns - self._raw[-1][0]) * 1e-9
             step[2] = wrap(float(step[2]))
-            begins_anew = not pose.any() and self._raw[-1][1].any()
+            x, y, yaw = self._raw[-1][1]
+            begins_anew = not pose.any() and (math.hypot(x, y) > _BACK_M or abs(wrap(float(yaw))) > _BACK_RAD)
             if begins_anew or not is_possible(step, elapsed_s):
                 step, self._changed = np.zeros(3), True
             elif self._imu.used and step.any():
