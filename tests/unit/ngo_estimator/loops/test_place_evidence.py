@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 
 from ngo_estimator.geometry.planar_motion import rotated
-from ngo_estimator.loops.place_evidence import PlaceEvidence, distinct_walls, place_evidence
+from ngo_estimator.loops.place_evidence import _MOST_EVER, PlaceEvidence, distinct_walls, place_evidence
 from ngo_estimator.loops.walls_seen_through import PlacedScans, placed, range_profile
+from ngo_estimator.slam.own_map import _ELSEWHERE
 from tests.unit.ngo_estimator.loops.buildings import HALLWAY, outline, scan_at
 
 POSES = np.array([(x, 1.0, 0.0) for x in np.arange(1.0, 4.0, 0.3)])
@@ -37,8 +38,8 @@ def test_walls_are_counted_however_long_they_are(turned: float) -> None:
 def test_the_same_place_agrees_and_another_one_is_seen_through() -> None:
     place, others = scans(HALLWAY), (scans(HALLWAY, 1), scans(LONGER, 1))
     same, other = (place_evidence(place, (stretch,)) for stretch in others)
-    assert same.walls >= 7 and same.through < 0.02 and same.said == 2
-    assert other.walls < same.walls and other.through > 0.05
+    assert same.walls >= 7 and same.mean < 0.02 and same.said
+    assert other.walls < same.walls and other.mean > 0.05
 
 
 def test_a_map_that_contradicts_itself_may_be_contradicted_and_a_place_as_likely_is_a_rival() -> None:
@@ -46,14 +47,19 @@ def test_a_map_that_contradicts_itself_may_be_contradicted_and_a_place_as_likely
     pairs = zip(vars(steady).values(), vars(opened).values(), strict=True)
     both = PlacedScans(*(np.concatenate(pair) for pair in pairs))
     assert place_evidence(steady, (steady,)).own == 0.0 and place_evidence(both, (steady,)).own > 0.003
-    at, bent = PlaceEvidence(8, 0.5, 3, mean=0.1, own=0.02), PlaceEvidence(8, 0.5, 3, mean=0.1, own=0.002)
-    assert at.suffices and not bent.suffices and not PlaceEvidence(7, 0.0, 3).suffices
-    assert bent.rivals(at) and not bent.rivals(replace(at, mean=0.04)) and not replace(bent, walls=7).rivals(at)
+    at, bent = PlaceEvidence(8, mean=0.1, own=0.02), PlaceEvidence(8, mean=0.1, own=0.002)
+    assert at.suffices and not bent.suffices and not PlaceEvidence(7).suffices
+    better = replace(at, mean=0.04)
+    assert bent.rivals(at) and not bent.rivals(better) and not replace(bent, walls=7).rivals(at)
+    assert at.rivals(better) and not replace(at, walls=7).rivals(better), "what suffices is a rival of all"
 
 
-def test_the_worst_part_of_the_stretch_counts_and_one_far_away_says_nothing() -> None:
-    place, same, other = scans(HALLWAY), scans(HALLWAY, 1), scans(LONGER, 1)
-    both = place_evidence(place, (same, other))
-    assert both.through == place_evidence(place, (other,)).through and both.said == 4
-    nothing = place_evidence(place, ())
-    assert (nothing.walls, nothing.through, nothing.said) == (0, 0.0, 0)
+def test_a_claim_is_never_made_where_it_would_be_taken_back() -> None:
+    wrong = PlaceEvidence(99, mean=0.32, own=0.22)
+    assert not wrong.suffices and not wrong.is_clear and replace(wrong, mean=0.29).suffices
+    assert _MOST_EVER < _ELSEWHERE
+
+
+def test_a_stretch_far_away_says_nothing() -> None:
+    nothing = place_evidence(scans(HALLWAY), ())
+    assert (nothing.walls, nothing.mean, nothing.said) == (0, 0.0, False)

@@ -30,14 +30,15 @@ COVARIANCE = np.diag((0.01, 0.01, 0.004)) ** 2
 NOTHING = np.zeros(0, np.float32)
 
 
-def steps(walls: np.ndarray, poses: np.ndarray) -> tuple[RelativeStep, ...]:
-    """The way round the hallway, then, in a segment of its own, the one among ``walls``; odometry goes straight on."""
-    random = np.random.default_rng(1)
-    true = np.concatenate((FIRST, poses))
-    seen = [scan_at(HALLWAY if k < len(FIRST) else walls, pose, random) for k, pose in enumerate(true)]
+def steps(walls: np.ndarray, poses: np.ndarray, hallways: int = 1) -> tuple[RelativeStep, ...]:
+    """The way round each hallway, then, in a segment of its own, the one among ``walls``; odometry goes straight on."""
+    random, round_all = np.random.default_rng(1), np.concatenate([FIRST + (40.0 * x, 0, 0) for x in range(hallways)])
+    true, begin = np.concatenate((round_all, poses)), len(round_all)
+    seen = [scan_at(HALLWAY, FIRST[k % len(FIRST)], random) for k in range(begin)]
+    seen += [scan_at(walls, pose, random) for pose in poses]
     seen = [replace(scan, stamp_ns=k * 10**9) for k, scan in enumerate(seen)]
     relative = between(true[:-1], true[1:]) + random.normal(0.0, (0.003, 0.003, 0.001), (len(true) - 1, 3))
-    relative[len(FIRST) - 1] = 0.0
+    relative[begin - 1] = 0.0
     odometry = [true[0]]
     for step in relative:
         odometry.append(compose(odometry[-1], step))
@@ -49,7 +50,7 @@ def steps(walls: np.ndarray, poses: np.ndarray) -> tuple[RelativeStep, ...]:
         found.append(
             RelativeStep(
                 *stamps, step, COVARIANCE, 0, odom, NOTHING, NOTHING, key=key, origin_scan=origin,
-                segment=k == len(FIRST),
+                segment=k == begin,
             )
         )  # fmt: skip
     return tuple(found)
@@ -107,8 +108,13 @@ def test_a_robot_in_another_building_is_not_found() -> None:
     assert joining_loops(core) == 0
 
 
+def test_a_robot_in_one_of_two_parts_that_are_alike_is_not_found() -> None:
+    updates = driven(steps(HALLWAY, BACK, hallways=2), ScanTrajectory())
+    assert all(update.lost_since_ns is not None for update in updates[2 * len(FIRST) - 1 :])
+
+
 def test_a_claim_that_later_scans_contradict_is_taken_back(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(OwnMap, "_evidence", lambda *_: PlaceEvidence(99, 0.0, 1))
+    monkeypatch.setattr(OwnMap, "_evidence", lambda *_: PlaceEvidence(99))
     core = ScanTrajectory()
     updates = driven(steps(OTHER, ALIKE), core)
     lost = np.array([update.lost_since_ns is not None for update in updates[len(FIRST) - 1 :]])

@@ -39,6 +39,10 @@ _LEAST_WALLS, _MOST_MEAN, _OWN_TIMES = 8, 0.02, 4.5
 """A claim needs so many different walls. The way may look through so much of the walls in the mean, and so many times
 as much as the place's own scans do: where people walk, and doors and furniture move, a map contradicts itself."""
 
+_MOST_EVER = 0.3
+"""However much it does: a wrong join makes a map that contradicts itself, and must not let in the next one. A claim is
+taken back above 0.35; right places of real logs look through up to 0.16, their maps through 0.06."""
+
 _FEWEST_WALLS = 4
 """So many walls tell places apart where nothing is looked through, and the more is, the more walls it takes."""
 
@@ -47,15 +51,13 @@ _FEWEST_WALLS = 4
 class PlaceEvidence:
     """``walls``: different straight walls that both see, where they were counted.
 
-    ``through``: the largest share of sightings through walls. ``said``: in how many parts of the stretch there were
-    sightings enough for a share. ``seen``: all sightings, and
+    ``said``: whether some part of the stretch has sightings enough for a share. ``seen``: all sightings, and
     ``mean``: the share of those of them that go through walls, and ``own`` that of the place's scans among each other.
     ``overlap``: the share of points of one side that the other one sees, or sees through.
     """
 
     walls: int
-    through: float
-    said: int
+    said: bool = False
     seen: int = 0
     mean: float = 0.0
     overlap: float = 0.0
@@ -64,7 +66,7 @@ class PlaceEvidence:
     @property
     def _most(self) -> float:
         """Of ``mean`` at the place of the way."""
-        return _MOST_MEAN + _OWN_TIMES * self.own
+        return min(_MOST_MEAN + _OWN_TIMES * self.own, _MOST_EVER)
 
     @property
     def suffices(self) -> bool:
@@ -72,8 +74,9 @@ class PlaceEvidence:
         return self.walls >= _LEAST_WALLS and self.mean <= self._most
 
     def rivals(self, better: "PlaceEvidence") -> bool:
-        """Whether this is nearly as likely as a better place: the way looks through less than twice as much."""
-        return self.walls >= _LEAST_WALLS and self.mean <= max(_MOST_MEAN, 2.0 * better.mean)
+        """Whether this suffices, or is nearly as likely as a better place: the way looks through less than twice as
+        much."""
+        return self.walls >= _LEAST_WALLS and self.mean <= max(self._most, 2.0 * better.mean)
 
     @property
     def is_clear(self) -> bool:
@@ -82,7 +85,7 @@ class PlaceEvidence:
         return bool(self.walls >= needed and self.mean <= self._most)
 
 
-NO_EVIDENCE = PlaceEvidence(0, 0.0, 0)
+NO_EVIDENCE = PlaceEvidence(0)
 """Of a stretch that comes nowhere near the place."""
 
 
@@ -149,12 +152,10 @@ def place_evidence(place: PlacedScans, stretch: Sequence[PlacedScans], count_wal
         possible += len(place.sensors) * len(part.points) + len(part.sensors) * len(place.points)
     walls = distinct_walls(np.concatenate(points), np.concatenate(normals)) if count_walls else 0
     # A wall that one side alone has is seen through by the other alone.
-    shares = [through / (through + on) for through, on in counts if through + on >= _SAID]
+    said = any(count.sum() >= _SAID for count in counts)
     through, on = np.sum([(0, 0), *counts], axis=0).tolist()
     seen = through + on
-    return PlaceEvidence(
-        walls, max(shares, default=0.0), len(shares), seen, through / max(1, seen), seen / possible, own
-    )
+    return PlaceEvidence(walls, said, seen, through / max(1, seen), seen / possible, own)
 
 
 def distinct_walls(points: np.ndarray, normals: np.ndarray) -> int:
