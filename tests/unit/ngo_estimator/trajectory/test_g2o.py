@@ -259,6 +259,9 @@ def test_of_two_edges_between_neighbours_the_step_is_the_one_that_the_vertices_w
         graph = _chained(tmp_path, mixed)
         assert graph.problem.steps.relative[3, 0] == 1.0
         assert graph.problem.loops.relative[:, 0].max() == 5.0 and len(graph.problem.loops) == 2
+    equal, near = [f"VERTEX_SE2 {k} 0 0 0" for k in range(16)], f"EDGE_SE2 3 4 0 0 0 {INFORMATION}"
+    graph = _chained(tmp_path, [*equal, *lines[16:], near])  # these are no first guess: the first edge is the step
+    assert graph.problem.steps.relative[3, 0] == 1.0
     twice = _chained(tmp_path, [*lines, *lines[16:-1]])
     assert len(twice.problem.loops) == 1 and len(_solved(twice).edges) == 2 * 15 + 1
 

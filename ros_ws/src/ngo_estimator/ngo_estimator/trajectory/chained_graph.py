@@ -22,8 +22,9 @@ class ChainedGraph:
     """A graph, sorted.
 
     An edge between neighbours that is not marked as a loop and knows the whole relative pose is a step: of several, the
-    one that fits the vertices' lines best. Where there is none, a step that knows next to nothing stands in: it is as
-    wide as the graph. A step that is written again is left out; all other edges are loops.
+    one that fits the vertices' lines best, or the first one where these are all equal. Where there is none, a step that
+    knows next to nothing stands in: it is as wide as the graph. A step that is written again is left out; all other
+    edges are loops.
 
     Attributes:
         graph: with its vertices by their ids, and those that had no line.
@@ -81,7 +82,8 @@ def chained(graph: PlanarGraph) -> ChainedGraph:
     poses, stamps = np.full((len(ids), 3), np.nan), np.full(len(ids), UNSTAMPED)
     poses[known], stamps[known] = graph.poses, graph.stamps_ns
     edges = RelativePoses(nodes, graph.relative, _roots(graph.information))
-    may_step = may_step[np.argsort(edges[may_step].squared(poses), kind="stable")]
+    if (graph.poses != graph.poses[:1]).any():  # equal ones are no first guess
+        may_step = may_step[np.argsort(edges[may_step].squared(poses), kind="stable")]
     begins, first = np.unique(nodes[may_step].min(1), return_index=True)
     steps = np.full(len(ids) - 1, _BREAK)
     steps[begins] = may_step[first]
