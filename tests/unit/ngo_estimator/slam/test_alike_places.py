@@ -1,4 +1,4 @@
-"""Rooms that look alike are noticed on the way through them; a ring of corridors that differ is not ambiguous."""
+"""A way is clear at its place alone, and a place is shown by the key scans around it, whichever drive they are of."""
 
 import numpy as np
 import pytest

@@ -165,12 +165,12 @@ class Localiser:
             self._track = fused(seen, *self._track)
 
     def _beyond_doubt(self) -> Mode | None:
-        """The strongest mode, if it is the only one where the way is clear, or has many sightings."""
+        """The strongest mode, if it is the only one where the way is clear; where none is, if it has many sightings."""
         matcher, strongest = self._matcher, self._modes[0]
         # A way that is clear has asked all frames, and not only those with sightings.
         clear = [mode for mode in self._modes if self._hurries and matcher.is_clear(mode.pose_xyyaw)]
-        if len(clear) == 1 and clear[0].support >= strongest.support:
-            return clear[0]
+        if clear:
+            return clear[0] if len(clear) == 1 and clear[0].support >= strongest.support else None
         many = self._supported(strongest, self._modes[1:])
         return strongest if many and matcher.allows(strongest.pose_xyyaw) else None
 
