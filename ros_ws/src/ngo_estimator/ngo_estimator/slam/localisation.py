@@ -175,7 +175,12 @@ class Localiser:
         return strongest if many and matcher.allows(strongest.pose_xyyaw) else None
 
     def _supported(self, mode: Mode, others: Sequence[Mode]) -> bool:
-        return may_claim(self.config, self._window, mode, others, self._matcher.place_m, len(self._window))
+        config, rival = self.config, max((other.support for other in others), default=0.0)
+        return (
+            mode.support >= config.least_share * len(self._window)
+            and rival <= config.most_rival * mode.support
+            and may_claim(config, self._window, mode, self._matcher.place_m)
+        )
 
     def _contradicted(self, hypotheses: Hypotheses, agree: np.ndarray) -> bool:
         """Whether the track is lost; ``agree`` says which hypotheses agree with it."""
@@ -193,22 +198,11 @@ class Localiser:
         return False
 
 
-def may_claim(
-    config: LocalisationConfig,
-    window: HypothesisWindow,
-    mode: Mode,
-    others: Sequence[Mode],
-    place_m: float,
-    looks: int,
-) -> bool:
-    """Whether a mode of a window's hypotheses is beyond doubt, with ``others`` as its rivals.
-
-    ``looks`` says of how many a share must support it.
-    """
-    way_m, rival = window.way_m[mode.looks], max((other.support for other in others), default=0.0)
+def may_claim(config: LocalisationConfig, window: HypothesisWindow, mode: Mode, place_m: float) -> bool:
+    """Whether a mode of a window's hypotheses has support enough, over a way that is long enough and up to now."""
+    way_m = window.way_m[mode.looks]
     return (
-        mode.support >= max(config.least_support, config.least_share * looks)
-        and rival <= config.most_rival * mode.support
+        mode.support >= config.least_support
         and float(way_m[0] - way_m[-1]) >= config.least_way_places * place_m
         and mode.looks[-1] >= len(window) - _NEW_LOOKS
     )

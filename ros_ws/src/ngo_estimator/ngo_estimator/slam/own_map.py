@@ -110,8 +110,8 @@ class OwnMap:
         modes = strongest_modes(hypotheses, place_m)
         if not modes:
             return ScanLoops.none()
-        # Between sightings the robot was perhaps where it had never been.
-        if not may_claim(self._claims, self._window, modes[0], (), place_m, 0):
+        # No share of all looks must support it: between sightings the robot was perhaps where it had never been.
+        if not may_claim(self._claims, self._window, modes[0], place_m):
             return ScanLoops.none()
         agree = agreeing(hypotheses, modes[0].pose_xyyaw, modes[0].covariance, place_m)
         pose, _ = fused(hypotheses.where(agree), modes[0].pose_xyyaw)
