@@ -53,7 +53,7 @@ from training.scoring.table import (
     samples,
 )
 
-ROWS = (*(rule for rule in RULES if rule != "tour"), "known_tour", "ours")
+ROWS = (*(rule for rule in RULES if rule != ExplorerConfig.rule), "known_tour", "ours")
 BASE = "explore_lite"
 _EXPLORER = tuple(
     import_module(f"ngo_explorer.{found.name}") for found in iter_modules(ngo_explorer.__path__) if not found.ispkg
@@ -178,7 +178,7 @@ def _measure(
     place: Place, name: str, most_s: float, estimator: Callable[[np.ndarray], Estimator] = TruePosesMap
 ) -> Measured:
     world = place.make()
-    config = ExplorerConfig(rule=name if name in RULES else "tour", radius_m=world.radius_m)
+    config = ExplorerConfig(rule=name if name in RULES else ExplorerConfig.rule, radius_m=world.radius_m)
     if name == "known_tour":
         run = drive_known_tour(world, place.seen, config, DriveConfig(), most_s)
     else:

@@ -35,7 +35,7 @@ def test_the_tables_of_two_mazes(tmp_path: Path) -> None:
     for entry in table.values():
         assert 0.0 < entry["coverage"]["mean"] < 1.0
         assert {"ended_early", "iou", "collisions", "decision_ms"} <= entry.keys()
-    assert "| **tour over frontiers** |" in (tmp_path / "results_explore.md").read_text()
+    assert "| **gain over distance (ours)** |" in (tmp_path / "results_explore.md").read_text()
     assert (tmp_path / "images" / "results_explore_mazes_coverage.png").stat().st_size > 0
 
 

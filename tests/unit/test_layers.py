@@ -66,7 +66,7 @@ LAYERS = {
         {"nodes"},
     ],
     "ngo_explorer": [
-        {"settings", "known_map", "tours"},
+        {"settings", "known_map"},
         {"frontiers", "planner", "boundary"},
         {"put_aside", "rules", "path_follower"},
         {"exploration"},

@@ -26,15 +26,15 @@ _ROWS = {
     "random": "random",
     "nearest": "nearest frontier",
     "explore_lite": "explore_lite's rule",
-    "gain_distance": "gain over distance",
     "d_optimality": "D-optimality of the graph",
     "known_tour": "tour on the known map",
-    "ours": "**tour over frontiers**",
+    "ours": "**gain over distance (ours)**",
 }
 _INTRODUCTION = """# Results: exploration
 
-One run a place and rule. Robot, map, path follower and limits are the same in all rows; explore_lite's has its own
-smallest frontier, pace and blacklist. Intervals are of 95 %, by resampling places; few places make them too narrow.
+One run a place and rule. Ours is the unknown area that a frontier shows by the way there. Robot, map, path follower and
+limits are the same in all rows; explore_lite's has its own smallest frontier, pace and blacklist. Intervals are of
+95 %, by resampling places; few places make them too narrow.
 
 Coverage counts the free cells that exact rays see from all places where the robot can go; what a robot has seen is
 entered at its true poses. Doors that may shut are shut for this, and fill their frames: what lies behind them does not

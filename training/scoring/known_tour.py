@@ -11,6 +11,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from numba import njit
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import dijkstra
 from scipy.spatial import cKDTree
@@ -18,7 +19,6 @@ from scipy.spatial import cKDTree
 from ngo_estimator.mapping.range_scan import RangeScan
 from ngo_explorer.known_map import KnownMap
 from ngo_explorer.planner import cost_field, line_is_free, plan_path
-from ngo_explorer.tours import tour
 
 _CELL_M = 0.25  # of what places see
 _JOINED_M = 0.75  # places this near are neighbours, if the way is free
@@ -97,6 +97,11 @@ def shortest_tour(sights: Sights, cells: float, rounds: int) -> list[int]:
     return best
 
 
+def in_order(first_m: np.ndarray, between_m: np.ndarray) -> np.ndarray:
+    """The order ``(n,)`` of the shortest way that is found over n places; first_m: ``(n,)`` ways from the start."""
+    return np.asarray(_improved(_inserted(first_m, between_m), first_m, between_m))
+
+
 def _filled(sights: Sights, order: list[int], cells: float, rng: np.random.Generator | None = None) -> list[int]:
     """Insert the stops that show most a metre until enough is seen; by ``rng`` not always the very best."""
     order, shown = list(order), sights.shown(order)
@@ -121,8 +126,7 @@ def _tidied(sights: Sights, order: list[int], cells: float) -> list[int]:
     between = sights.ways_m[:, sights.stops]
     if len(order) > 2:
         inner = np.array(order[1:])
-        found, _ = tour(between[0, inner], between[np.ix_(inner, inner)])
-        ordered = [0, *inner[found].tolist()]
+        ordered = [0, *inner[in_order(between[0, inner], between[np.ix_(inner, inner)])].tolist()]
         if sights.length_m(ordered) < sights.length_m(order) and sights.shown(ordered).sum() >= cells:
             order = ordered
     for stop in order[:0:-1]:
@@ -163,3 +167,72 @@ def _cells(point: np.ndarray, ends: np.ndarray) -> np.ndarray:
     places = point + away[:, None] / np.maximum(lengths, 1e-6)[:, None, None] * steps[:, None]
     at = np.floor(places[steps < lengths[:, None]] / _CELL_M).astype(np.int64)
     return np.unique(at[:, 1] * 1_000_000 + at[:, 0])
+
+
+@njit(cache=True)
+def _inserted(first: np.ndarray, between: np.ndarray) -> np.ndarray:
+    """Nearest insertion: the place nearest to the tour so far enters where it costs least."""
+    count = len(first)
+    order = np.empty(count, np.int64)
+    order[0] = int(np.argmin(first))
+    inside = np.zeros(count, np.bool_)
+    inside[order[0]] = True
+    gaps = between[order[0]].copy()
+    for filled in range(1, count):
+        chosen = -1
+        for place in range(count):
+            if not inside[place] and (chosen < 0 or gaps[place] < gaps[chosen]):
+                chosen = place
+        best, position = np.inf, filled
+        for at in range(filled + 1):
+            before = first[chosen] if at == 0 else between[order[at - 1], chosen]
+            if at == filled:
+                more = before
+            else:
+                after = order[at]
+                more = before + between[chosen, after] - (first[after] if at == 0 else between[order[at - 1], after])
+            if more < best:
+                best, position = more, at
+        order[position + 1 : filled + 1] = order[position:filled].copy()
+        order[position] = chosen
+        inside[chosen] = True
+        gaps = np.minimum(gaps, between[chosen])
+    return order
+
+
+@njit(cache=True)
+def _length(order: np.ndarray, first: np.ndarray, between: np.ndarray) -> float:
+    total = first[order[0]]
+    for index in range(1, len(order)):
+        total += between[order[index - 1], order[index]]
+    return total
+
+
+@njit(cache=True)
+def _improved(order: np.ndarray, first: np.ndarray, between: np.ndarray) -> np.ndarray:
+    """Reverse and move parts of the tour while that makes it shorter."""
+    count, rounds, changed = len(order), 0, True
+    best = _length(order, first, between)
+    while changed and rounds < 50:
+        changed = False
+        rounds += 1
+        for begin in range(count - 1):
+            for end in range(begin + 1, count):
+                tried = order.copy()
+                tried[begin : end + 1] = order[begin : end + 1][::-1]
+                length = _length(tried, first, between)
+                if length < best - 1e-9:
+                    order[:] = tried
+                    best, changed = length, True
+        for size in range(1, min(4, count)):
+            for begin in range(count - size + 1):
+                for target in range(count - size + 1):
+                    if target == begin:
+                        continue
+                    rest = np.concatenate((order[:begin], order[begin + size :]))
+                    tried = np.concatenate((rest[:target], order[begin : begin + size], rest[target:]))
+                    length = _length(tried, first, between)
+                    if length < best - 1e-9:
+                        order[:] = tried
+                        best, changed = length, True
+    return order

@@ -1,14 +1,13 @@
-"""Frontiers, paths and tours of maps drawn by hand."""
-
-from itertools import permutations
+"""Frontiers and paths of maps drawn by hand."""
 
 import numpy as np
 import pytest
 
-from ngo_explorer.frontiers import FrontierFinder, gains_m2
+from ngo_explorer.frontiers import Candidate, Frontier, FrontierFinder, gains_m2
 from ngo_explorer.known_map import KnownMap
 from ngo_explorer.planner import cost_field, line_is_free, plan_path
-from ngo_explorer.tours import tour
+from ngo_explorer.rules import Situation, make_rule
+from ngo_explorer.settings import ExplorerConfig
 
 from .drawn_maps import drawn
 
@@ -106,48 +105,16 @@ def test_a_robot_in_a_gap_that_is_a_cell_too_narrow_may_leave_on_both_sides() ->
         assert [plan_path(known, field, start, goal, need_m) is not None for goal in goals].count(True) == ways
 
 
-def brute_force(first: np.ndarray, between: np.ndarray) -> float:
-    return min(
-        first[order[0]] + sum(between[a, b] for a, b in zip(order[:-1], order[1:], strict=True))
-        for order in permutations(range(len(first)))
-    )
-
-
 def test_a_robot_that_seems_to_stand_in_a_wall_is_on_one_side_of_it() -> None:
     known = known_of(drawn("#" * 22, *[f"#{'.' * 9}##{'.' * 9}#"] * 20, "#" * 22))
     field = cost_field(known, np.array((1.1, 1.1)), NEED_M)
     assert sorted(((field[:, :5] >= 0).any(), (field[:, 6:] >= 0).any())) == [False, True]
 
 
-def test_a_tour_over_seven_places_is_the_shortest_or_nearly() -> None:
-    rng = np.random.default_rng(1)
-    ratios = []
-    for _ in range(12):
-        points = rng.uniform(0.0, 10.0, (8, 2))
-        gaps = np.hypot(*(points[:, None] - points[None]).transpose(2, 0, 1))
-        order, length = tour(gaps[0, 1:].copy(), gaps[1:, 1:].copy())
-        assert sorted(order) == list(range(7))
-        ratios.append(length / brute_force(gaps[0, 1:], gaps[1:, 1:]))
-    assert min(ratios) >= 1.0 - 1e-9 and np.mean(ratios) < 1.02 and max(ratios) < 1.1
+def test_by_gain_over_distance_a_near_nook_comes_before_a_large_room_only_if_it_shows_more_a_metre() -> None:
+    def chosen(nook_m2: float) -> int:
+        at = np.zeros((1, 2))
+        edges = [Candidate(Frontier(at, at[0], 1.0), at[0], *way_gain) for way_gain in ((1.0, nook_m2), (6.0, 20.0))]
+        return make_rule(ExplorerConfig(), np.random.default_rng(0))(Situation(at[0], edges, -1, at))
 
-
-def test_a_tour_visits_the_near_dead_end_before_it_goes_far() -> None:
-    points = np.array(((0.0, 0.0), (-2.0, 0.0), (-2.5, 0.0), (12.0, 0.0)))
-    gaps = np.abs(points[:, None, 0] - points[None, :, 0])
-    order, length = tour(gaps[0, 1:].copy(), gaps[1:, 1:].copy())
-    assert order.tolist() == [0, 1, 2] and length == 17.0
-
-
-def test_a_tour_by_worth_goes_to_the_large_room_before_the_near_nook() -> None:
-    places = np.array((1.0, -3.0, -4.0))
-    between = np.abs(places[:, None] - places)
-    order, length = tour(np.abs(places), between)
-    assert order.tolist() == [0, 1, 2] and length == pytest.approx(6.0)
-    order, cost = tour(np.abs(places), between, worth=np.array((0.5, 20.0, 20.0)))
-    assert order.tolist() == [1, 2, 0] and cost == pytest.approx(20.0 * 3.0 + 20.0 * 4.0 + 0.5 * 9.0 + 0.3 * 9.0 * 40.5)
-
-
-def test_a_given_first_place_stays_first() -> None:
-    gaps = np.abs(np.arange(5.0)[:, None] - np.arange(5.0)[None])
-    order, _ = tour(gaps[0, 1:].copy(), gaps[1:, 1:].copy(), start=2)
-    assert order[0] == 2
+    assert (chosen(3.0), chosen(4.0)) == (1, 0)

@@ -117,7 +117,7 @@ class Exploration:
         while self.candidates:
             present = self._present(before)
             trail = np.array([*self._trail, robot])
-            seen = Situation(self.known, robot, self.candidates, present, trail, self.need_m)
+            seen = Situation(robot, self.candidates, present, trail)
             chosen = self._rule(seen)
             candidate = self.candidates[chosen]
             path = plan_path(self.known, field, robot, candidate.viewpoint_xy, self.need_m)

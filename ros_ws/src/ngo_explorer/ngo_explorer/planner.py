@@ -16,15 +16,13 @@ _TIGHT = 20  # tenths that a step costs more where the clearance is the least, a
 _ESCAPE_M = 0.8  # a robot that stands too near an obstacle may start from a block as far as this
 
 
-def cost_field(known: KnownMap, start_xy: Floats, need_m: float, targets: Floats | None = None) -> NDArray[np.int32]:
+def cost_field(known: KnownMap, start_xy: Floats, need_m: float) -> NDArray[np.int32]:
     """Costs ``(rows / block, columns / block)`` of paths from a point to all blocks; -1 where there is none.
 
-    In tenths of a block's side; a step costs up to three times its length where walls are near. With ``targets``
-    ``(n, 2)`` the costs of other blocks may be missing. By Dijkstra's algorithm with buckets (Dial 1969).
+    In tenths of a block's side; a step costs up to three times its length where walls are near. By Dijkstra's
+    algorithm with buckets (Dial 1969).
     """
-    goals = known.cells(np.zeros((0, 2)) if targets is None else targets) // known.block
-    starts = _start_blocks(known, start_xy, need_m)
-    return np.asarray(_costs(known.roomy_m, need_m, known.comfort_m, starts, goals))
+    return np.asarray(_costs(known.roomy_m, need_m, known.comfort_m, _start_blocks(known, start_xy, need_m)))
 
 
 def plan_path(
@@ -86,18 +84,10 @@ def _costs(
     need: float,
     comfort: float,
     starts: NDArray[np.int64],
-    goals: NDArray[np.int64],
 ) -> NDArray[np.int32]:
     rows, columns = roomy.shape
     costs = np.full((rows, columns), -1, np.int32)
     done = np.zeros((rows, columns), np.bool_)
-    awaited = np.zeros((rows, columns), np.bool_)
-    left = 0
-    for index in range(len(goals)):
-        row, column = goals[index]
-        if 0 <= row < rows and 0 <= column < columns and not awaited[row, column]:
-            awaited[row, column] = True
-            left += 1
     heads = np.full(_BUCKETS, -1, np.int64)
     entries = np.empty(1024 + len(starts), np.int64)
     following = np.empty(1024 + len(starts), np.int64)
@@ -119,10 +109,6 @@ def _costs(
         if done[row, column]:
             continue
         done[row, column] = True
-        if awaited[row, column]:
-            left -= 1
-            if left == 0:
-                break
         for d_row in range(-1, 2):
             for d_column in range(-1, 2):
                 r, c = row + d_row, column + d_column

@@ -1,4 +1,4 @@
-"""Rules that choose the next frontier: ours looks ahead along a tour, the others are those of the literature."""
+"""Rules that choose the next frontier: the unknown area a metre by default, and others of the literature."""
 
 from __future__ import annotations
 
@@ -9,15 +9,12 @@ from dataclasses import dataclass
 import numpy as np
 
 from ngo_explorer.frontiers import Candidate
-from ngo_explorer.known_map import Floats, KnownMap
-from ngo_explorer.planner import cost_field, line_is_free
+from ngo_explorer.known_map import Floats
 from ngo_explorer.settings import ExplorerConfig
-from ngo_explorer.tours import tour
 
 _LOOP_M = 2.0  # a node this near is taken for a loop closure (Placed et al.)
 _NODE_M = 1.0  # between two nodes of a predicted graph
 _MOST_NODES = 150  # of the graph of where the robot was
-_PLACE_M = 2.0  # viewpoints nearer than this are one place of a tour
 
 
 @dataclass(frozen=True, eq=False)
@@ -28,12 +25,10 @@ class Situation:
     robot was, some metres apart, the newest last.
     """
 
-    known: KnownMap
     robot_xy: Floats
     candidates: Sequence[Candidate]
     present: int
     trail: Floats
-    need_m: float
 
 
 Rule = Callable[[Situation], int]
@@ -48,8 +43,6 @@ def make_rule(config: ExplorerConfig, rng: np.random.Generator) -> Rule:
         "gain_distance": lambda seen: np.array([c.gain_m2 for c in seen.candidates]) / np.maximum(_ways(seen), 0.5),
         "d_optimality": _d_optimality,
     }
-    if config.rule == "tour":
-        return lambda seen: _along_a_tour(seen, config)
     if config.rule == "random":
         return lambda seen: seen.present if seen.present >= 0 else int(rng.integers(len(seen.candidates)))
     score = scores[config.rule]
@@ -67,56 +60,6 @@ def _explore_lite(seen: Situation) -> Floats:
         at = candidate.frontier.points_xy
         costs.append(3.0 * np.hypot(*(at - seen.robot_xy).T).min() - 1.0 * candidate.frontier.size_m)
     return -np.array(costs)
-
-
-def _along_a_tour(seen: Situation, config: ExplorerConfig) -> int:
-    """The first of the tour that sees unknown area soonest; the present one unless that costs clearly more."""
-    ways, worth = _ways(seen), _places(seen, config.most_in_tour)
-    places, gains = np.array(list(worth)), np.array(list(worth.values()))
-    if len(places) == 1:
-        return int(places[0])
-    between = _between(seen, np.array([seen.candidates[place].viewpoint_xy for place in places]))
-    order, cost = tour(ways[places], between, worth=gains)
-    if seen.present >= 0 and places[order[0]] != seen.present:
-        _, present_cost = tour(ways[places], between, int(np.flatnonzero(places == seen.present)[0]), gains)
-        if cost > (1.0 - config.switch) * present_cost:
-            return seen.present
-    return int(places[order[0]])
-
-
-def _places(seen: Situation, most: int) -> dict[int, float]:
-    """The nearest candidates and the largest gain of those that are seen from the same place, the present one first.
-
-    The many frontiers of one room would else be the whole tour, and the next room none of it.
-    """
-    worth: dict[int, float] = {}
-    nearest = np.argsort(_ways(seen), kind="stable").tolist()
-    for index in [seen.present, *nearest] if seen.present >= 0 else nearest:
-        place = next((place for place in worth if _same_place(seen, place, index)), index)
-        if place in worth or len(worth) < most:
-            worth[place] = max(worth.get(place, 0.0), seen.candidates[index].gain_m2)
-    return worth
-
-
-def _same_place(seen: Situation, one: int, other: int) -> bool:
-    begin, end = seen.candidates[one].viewpoint_xy, seen.candidates[other].viewpoint_xy
-    return bool(np.hypot(*(end - begin)) < _PLACE_M) and line_is_free(seen.known, begin, end, seen.need_m)
-
-
-def _between(seen: Situation, points: Floats) -> Floats:
-    """``(n, n)`` costs of the paths between points, in m; fastest where the nearest to the robot come first."""
-    known, count = seen.known, len(points)
-    unit = known.block * known.resolution_m / 10.0
-    blocks = known.cells(points) // known.block
-    between = np.zeros((count, count))
-    # A search ends at the farthest of the points that are left: those near the robot come last, near each other.
-    for index in range(count - 1, 0, -1):
-        field = cost_field(known, points[index], seen.need_m, points[:index])
-        costs = field[blocks[:, 0], blocks[:, 1]].astype(np.float64) * unit
-        straight = np.hypot(*(points - points[index]).T)
-        row = np.where(costs < 0.0, 1e3, np.maximum(costs, straight))
-        between[index, :index] = between[:index, index] = row[:index]
-    return between
 
 
 def _d_optimality(seen: Situation) -> Floats:

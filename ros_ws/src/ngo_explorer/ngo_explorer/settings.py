@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 from ngo_common.settings import Settings, setting
 
-RULES = ("tour", "random", "nearest", "explore_lite", "gain_distance", "d_optimality")
+RULES = ("gain_distance", "random", "nearest", "explore_lite", "d_optimality")
 
 
 @dataclass(frozen=True)
@@ -12,10 +12,9 @@ class ExplorerConfig(Settings):
     """What the robot is, what a frontier is, and how the next one is chosen."""
 
     rule: str = setting(
-        "tour",
-        "Chooses the next frontier. tour: the first of a tour that sees the most unknown area early; random; "
-        "nearest: shortest path; explore_lite: 3 x distance - size, as that package; gain_distance: most unknown area "
-        "a metre; d_optimality: of the predicted pose graph.",
+        "gain_distance",
+        "Chooses the next frontier. gain_distance: most unknown area a metre; random; nearest: shortest path; "
+        "explore_lite: 3 x distance - size, as that package; d_optimality: of the predicted pose graph.",
         choices=RULES,
     )
     radius_m: float = setting(0.22, "Radius of the robot, m.", minimum=0.02, maximum=2.0)
@@ -25,9 +24,7 @@ class ExplorerConfig(Settings):
     frontier_m: float = setting(0.75, "Length of the smallest frontier, m.", minimum=0.0, maximum=10.0)
     gain_m2: float = setting(0.1, "Unknown area that a frontier must show from its viewpoint, m^2.", minimum=0.0)
     gain_range_m: float = setting(4.0, "Distance beyond a frontier up to which unknown area is gain, m.", minimum=0.3)
-    most_in_tour: int = setting(10, "Places of which a tour is made, the nearest ones.", minimum=1, maximum=100)
     replan_s: float = setting(2.0, "Time between two decisions on the way, s.", minimum=0.1, maximum=600.0)
-    switch: float = setting(0.15, "Share by which a new goal must be better than the present one.", minimum=0.0)
     progress_s: float = setting(15.0, "Time without progress after which a goal is put aside, s.", minimum=1.0)
     wait_s: float = setting(300.0, "Time that it waits in all for ways that shut, s.", minimum=0.0, maximum=86400.0)
 
