@@ -118,19 +118,24 @@ def main(arguments: Arguments) -> dict[str, Any]:
 
 
 def _keep_published(result: dict[str, Any], published: Mapping[str, Any]) -> None:
-    """Take over the tables that are published and not measured anew, with their failures.
+    """Take over what is published and not measured anew, with its failures: the logs, and rows of tables.
 
-    ``earlier`` of the result names the revision and the settings of each of them.
+    ``earlier`` of the result names the revision and the settings of each table with such rows, and its rows that were
+    ``measured`` anew.
     """
     result["earlier"] = {}
     for name in ("logs", *result["tables"]):
         new, old = (result, published) if name == "logs" else (result["tables"], published.get("tables", {}))
-        if not new[name] and old.get(name):
-            new[name] = old[name] if name == "logs" else _known(old[name])
-            result["paired"][name] = _known(published["paired"].get(name, {}))
+        measured, known = list(new[name]), old.get(name, {}) if name == "logs" else _known(old.get(name, {}))
+        if known.keys() - measured and not (name == "logs" and measured):
+            new[name] = {**known, **new[name]}
+            result["paired"][name] = {**_known(published["paired"].get(name, {})), **result["paired"][name]}
             of = {"revision": published["revision"], "settings": published["settings"]}
-            result["earlier"][name] = published.get("earlier", {}).get(name, of)
-    result["failed"] += [line for line in published.get("failed", ()) if line.partition(",")[0] in result["earlier"]]
+            result["earlier"][name] = {**published.get("earlier", {}).get(name, of), "measured": measured}
+    for line in published.get("failed", ()):
+        table, _, row = line.partition(":")[0].split(", ")
+        if row not in result["earlier"].get(table, {}).get("measured", (row,)):
+            result["failed"].append(line)
 
 
 def _known(rows: Mapping[str, Any]) -> dict[str, Any]:
@@ -244,7 +249,9 @@ def _compared(key: str, both: np.ndarray) -> dict[str, Any]:
 
 
 def _paired_with(row: str) -> str:
-    """Our row that another one is compared with."""
+    """Our row that another one is compared with: a peer's with as many wrong loops, ours with none."""
+    if row.startswith("ours_") and row.endswith("percent_wrong"):
+        return "ours_0_percent_wrong"
     if row.endswith("percent_wrong"):
         return "_".join(("ours", *row.split("_")[-3:]))
     return "ours"

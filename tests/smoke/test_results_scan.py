@@ -47,6 +47,7 @@ def test_results_of_two_tiny_buildings(tmp_path: Path, monkeypatch: pytest.Monke
     assert ate["ci95"][0] <= ate["mean"] <= ate["ci95"][1]
     assert result["paired"]["buildings"]["wheels"]["ate_m"]["relative_percent"]["mean"] > 0.0
     assert result["paired"]["aliased"]["gtsam_lm_30_percent_wrong"]["with"] == "ours_30_percent_wrong"
+    assert result["paired"]["aliased"]["ours_30_percent_wrong"]["with"] == "ours_0_percent_wrong"
     assert result["logs"] == {}
     assert result["failed"] == []
     assert [line for line in result["skipped"] if line.startswith("logs: no folder")]
@@ -73,7 +74,8 @@ def test_results_of_two_tiny_buildings(tmp_path: Path, monkeypatch: pytest.Monke
     shifted = results_scan.main(replace(arguments, known=True, first_building=1))
     assert shifted["settings"]["first_building"] == 1
     assert shifted["tables"]["buildings"] == known["tables"]["buildings"]  # what is published stays, and says so
-    assert shifted["earlier"]["buildings"] == {"revision": known["revision"], "settings": known["settings"]}
+    of = {"revision": known["revision"], "settings": known["settings"]}
+    assert shifted["earlier"]["buildings"] == {**of, "measured": []}
     page = (tmp_path / "docs" / "results_scan.md").read_text()
     assert "of an earlier revision: buildings" in page and "results_scan_buildings.png" in page
     assert shifted["tables"]["aliased"]["ours"]["ate_m"]["drives"] == 1

@@ -74,7 +74,10 @@ def page(result: Mapping[str, Any], images: Mapping[str, str]) -> str:
 
 
 def _earlier(tables: Mapping[str, Any]) -> list[str]:
-    names = [f"{name} (`{of['revision']}`)" for name, of in tables.items()]
+    names = []
+    for name, of in tables.items():
+        anew = ", ".join(map(_title, of["measured"]))
+        names.append(f"{name} (`{of['revision']}`{f'; anew: {anew}' if anew else ''})")
     return [f"**Not measured anew, and so of an earlier revision: {', '.join(names)}.**"] if names else []
 
 
@@ -96,6 +99,10 @@ def _changed(result: Mapping[str, Any]) -> list[str]:
             "a row agree with each other. Each number is the mean over three draws.",
             _across({name: {row: rows[row] for row in _FED if row in rows} for name, rows in fed.items()}, *_ERRORS),
         ]
+    for name in _BUILDING_TITLES:
+        paired = result["paired"][name]
+        if ours := {row: paired[row] for row in paired if paired[row]["with"] == "ours_0_percent_wrong"}:
+            parts += [f"Ours in `{name}` against none wrong, same drives:", _against_ours(ours)]
     return parts
 
 

@@ -13,13 +13,13 @@ _GROUP = 5
 
 @dataclass(frozen=True)
 class WrongLoopsConfig:
-    """Wrong loops are ``percent`` of all; they are drawn once for each of the ``seeds``."""
+    """Wrong loops are ``percent`` of all, or none; they are drawn once for each of the ``seeds``."""
 
     percent: float
     seeds: Sequence[int] = (0, 1, 2)
 
     def __post_init__(self) -> None:
-        check(self, "percent", "between 0 and 100", lambda x: 0.0 < x < 100.0)
+        check(self, "percent", "from 0 on, below 100", lambda x: 0.0 <= x < 100.0)
         check(self, "seeds", "one or more, from 0 on", lambda x: x >= 0)
 
 
