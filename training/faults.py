@@ -1,4 +1,4 @@
-"""Measure how honest deviations are on drives with faults of the sensor, and in worlds that the networks do not know.
+"""Measure how consistent deviations are with faults of the sensor, and in worlds that the networks do not know.
 
     python -m training.faults
 
@@ -28,8 +28,8 @@ from training.data.faults import SensedDrive, faulted
 from training.data.worlds import TEST_SEEDS, VALIDATION_SEEDS, world_named
 from training.report import faults_page
 from training.report.folders import Folders
-from training.scoring import honesty
-from training.scoring.honesty import HonestRun, honest_run
+from training.scoring import consistency
+from training.scoring.consistency import ConsistencyRun, consistency_run
 from training.scoring.table import Drive, Measured, Row, column, folder_digest, intervals, means_over_samples, measure
 
 CLEAN = "clean"
@@ -43,7 +43,7 @@ SCENARIOS = {
 }
 """Maps that ViZDoom ships, each the first of a WAD of its name. Everything was chosen on those of validation."""
 
-_CODE = (honesty, local_odometry, online_trajectory)
+_CODE = (consistency, local_odometry, online_trajectory)
 _DOOM_SEEDS = {"test": 20_000, "validation": 11_000}
 _SEEDS = {"test": TEST_SEEDS, "validation": VALIDATION_SEEDS}
 
@@ -104,9 +104,9 @@ def _table(arguments: Arguments, world: str) -> dict[str, Any]:
 
 
 def _measured(drive: SensedDrive, cores: _Cores, clean: bool) -> Measured:
-    values = dataclasses.asdict(honest_run(cores.local, cores.online, drive))
+    values = dataclasses.asdict(consistency_run(cores.local, cores.online, drive))
     if clean:
-        plain: HonestRun = honest_run(cores.plain, cores.online, drive)
+        plain: ConsistencyRun = consistency_run(cores.plain, cores.online, drive)
         values["deviation_growth"] = values["deviation_m"] / plain.deviation_m
         values["odometry_deviation_growth"] = values["odometry_deviation_m"] / plain.odometry_deviation_m
     return Measured.of(values)

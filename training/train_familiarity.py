@@ -43,11 +43,11 @@ from training.data.faults import FAULTS, SensedDrive, faulted
 from training.data.features import Networks
 from training.data.worlds import OPTIMIZER_TRAIN_SEEDS, VALIDATION_SEEDS, World, world_named
 from training.recordings.recording_source import DataArguments, open_recorded
-from training.scoring.honesty import estimates_of, odometry_covariances
+from training.scoring.consistency import estimates_of, odometry_covariances
 from training.scoring.metrics import within
 
 FACTORS = (0.7, 1.0, 1.4, 2.0)
-"""Factors that are tried. Less than the first is not honest on Doom maps that nothing was trained on."""
+"""Factors that are tried. Less than the first is not consistent on Doom maps that nothing was trained on."""
 
 _WANTED = 0.97
 _MARGIN = 1.25
@@ -119,7 +119,7 @@ def main(arguments: Arguments) -> Familiarity:
     save_weights(folder, familiarity, FAMILIARITY, details)
     limits = {kind: round(limit, 3) for kind, limit in zip(DISTANCES, familiarity.config.limits, strict=True)}
     print(f"{name}: limits {limits}, factor {disagreement}, within three deviations {shares}")
-    if missed := dishonest(shares):
+    if missed := inconsistent(shares):
         print(f"{name}: deviations stay too small with {missed}: the largest factor, {FACTORS[-1]}, is not enough")
     return familiarity
 
@@ -240,7 +240,7 @@ def with_config(familiarity: Familiarity, config: FamiliarityConfig) -> Familiar
 def fit_disagreement(
     networks: Networks, familiarity: Familiarity, world: str, drives: list[SensedDrive]
 ) -> tuple[float, dict[str, float]]:
-    """The smallest factor with which drives with each fault are honest, and the shares of their poses within.
+    """The smallest factor with which drives with each fault are consistent, and the shares of their poses within.
 
     Without drives nothing is known of any factor: it stays as it is, and there are no shares.
     """
@@ -257,7 +257,7 @@ def fit_disagreement(
     return FACTORS[-1], shares
 
 
-def dishonest(shares: dict[str, float]) -> str:
+def inconsistent(shares: dict[str, float]) -> str:
     """The faults with which too few poses are within three deviations, and their shares; empty where there are none."""
     return ", ".join(f"{kind} ({share:.1%})" for kind, share in shares.items() if share < _WANTED)
 

@@ -202,10 +202,10 @@ def main(arguments: Arguments) -> PoseGraphSettings:
     start = PoseGraphSettings()
     # Overlaps are looked for as in our optimizer; whether they help is one more thing to try, with each search.
     counts = dict.fromkeys((world.overlaps if registrations else 0, 0))
-    ways = [{"registrations": registrations, "overlaps": count} for count in counts]
-    start = replace(start, search=replace(start.search, **ways[0]))
+    searches = [{"registrations": registrations, "overlaps": count} for count in counts]
+    start = replace(start, search=replace(start.search, **searches[0]))
     grid = [
-        [_searching(change, **way) for change in group for way in (ways if "search" in change else ways[:1])]
+        [_searching(change, **how) for change in group for how in (searches if "search" in change else searches[:1])]
         for group in GRID
     ]
     smoother: OdometrySmoother | None = None

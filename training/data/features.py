@@ -44,20 +44,20 @@ def features_of(
 
 @torch.inference_mode()
 def step_features(
-    frames: Callable[[slice], Tensor], told_steps: Batch, poses_xyyaw: np.ndarray, networks: Networks
+    frames: Callable[[slice], Tensor], controls: Batch, poses_xyyaw: np.ndarray, networks: Networks
 ) -> dict[str, np.ndarray]:
     """Features of ``steps`` steps, the place code of the first frame, and the true poses after each step, seen from it.
 
     Args:
         frames: gives images of a range of frames ``(n, height, width, channels)``.
-        told_steps: ``action`` ``(steps, n)``, the latest ones of each step, and ``twist`` ``(steps, 3)``, where the
+        controls: ``action`` ``(steps, n)``, the latest ones of each step, and ``twist`` ``(steps, 3)``, where the
             networks take them.
         poses_xyyaw: ``(steps + 1, 3)``.
     """
     parts: list[tuple[Tensor, ...]] = []
     for chunk in torch.arange(len(poses_xyyaw) - 1).split(_CHUNK):
         images = frames(slice(int(chunk[0]), int(chunk[-1]) + 2))
-        side = {name: value[chunk] for name, value in told_steps.items()}
+        side = {name: value[chunk] for name, value in controls.items()}
         relative, log_std, motion = networks.local(images[:-1], images[1:], side.get("action"), side.get("twist"))
         parts.append((relative, log_std, motion, networks.place.encoder(images[1:])))
     relative, log_std, motion, codes = (torch.cat(column) for column in zip(*parts, strict=True))

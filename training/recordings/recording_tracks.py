@@ -144,13 +144,13 @@ def split(
     words = []
     half_gap = math.ceil(0.5 * GAP_S / period)
     for part in PARTS:
-        told = []
+        parts = []
         for number in sorted(shares):
             for _, first, last in (share for share in shares[number] if share[0] == part):
                 found[part] += within(len(recordings[number].stamps_ns), tracks[number], first, last, half_gap)
-                told.append(recordings[number].name + ("" if last - first == 1.0 else f" {first:.0%} to {last:.0%}"))
+                parts.append(recordings[number].name + ("" if last - first == 1.0 else f" {first:.0%} to {last:.0%}"))
         count = sum(len(track) for track in found[part])
-        words.append(f"{part}: {count} frames of {', '.join(told) or 'nothing'}")
+        words.append(f"{part}: {count} frames of {', '.join(parts) or 'nothing'}")
     return Split(found, tuple(words))
 
 

@@ -80,16 +80,16 @@ def _drive(nodes: int, rng: np.random.Generator) -> np.ndarray:
     """True poses ``(nodes, 3)``: half a metre a step along the streets of a square town, of nine metres a block."""
     side = max(3, round(math.sqrt(nodes / 60.0)))
     at, heading, steps = np.array((side // 2, side // 2)), 0, np.zeros((nodes - 1, 3))
-    ways = np.array(((1, 0), (0, 1), (-1, 0), (0, -1)))
+    directions = np.array(((1, 0), (0, 1), (-1, 0), (0, -1)))
     k, block = 0, 18
     while k < nodes - 1:
-        open_ways = [w for w in range(4) if ((at + ways[w] >= 0) & (at + ways[w] < side)).all()]
-        ahead = [w for w in open_ways if (w - heading) % 4 != 2] or open_ways
+        open_turns = [w for w in range(4) if ((at + directions[w] >= 0) & (at + directions[w] < side)).all()]
+        ahead = [w for w in open_turns if (w - heading) % 4 != 2] or open_turns
         following = int(rng.choice(ahead))
         turn = ((following - heading + 1) % 4 - 1) * math.pi / 2.0
         steps[k : k + block, 0] = 0.5
         steps[k, 2] = turn
-        at, heading, k = at + ways[following], following, k + block
+        at, heading, k = at + directions[following], following, k + block
     return chain_poses(steps)
 
 

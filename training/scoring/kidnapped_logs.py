@@ -86,12 +86,12 @@ def summary_of(starts: list[LogStart]) -> dict[str, Any]:
     """Counts of starts in mapped parts and elsewhere, and the median way to a right claim."""
     result: dict[str, Any] = {}
     for name, some in (("mapped", [x for x in starts if x.mapped]), ("unmapped", [x for x in starts if not x.mapped])):
-        ways = [start.way_m for start in some if start.right]
+        paths_m = [start.way_m for start in some if start.right]
         result[name] = {
             "starts": len(some),
-            "right": len(ways),
+            "right": len(paths_m),
             "false_claims": sum(start.claimed and not start.right for start in some),
-            "way_to_success_m": float(np.median(ways)) if ways else None,
+            "way_to_success_m": float(np.median(paths_m)) if paths_m else None,
             "processor_s_per_m": float(np.mean([start.processor_s_per_m for start in some])) if some else None,
         }
     return result

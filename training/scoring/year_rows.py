@@ -173,8 +173,8 @@ class _Drive:
         with np.load(self._folder(-1) / "truth.npz") as kept:
             self._known = TruePoses(kept["stamps_ns"], kept["poses_xyyaw"])
         steps, self._found_at = self._front.steps, self._map_from_truth()
-        ways, search = KDTree(self._known.poses_xyyaw[:, :2]), self._session.localisation()
-        near = ways.query(self._truth.poses_xyyaw[:, :2])[0] <= _MAPPED_M
+        known_places, search = KDTree(self._known.poses_xyyaw[:, :2]), self._session.localisation()
+        near = known_places.query(self._truth.poses_xyyaw[:, :2])[0] <= _MAPPED_M
         claims: list[tuple[bool, int]] = []
         for start in np.linspace(0, len(steps) - MOST_SCANS, self._year.starts, endpoint=False).astype(int).tolist():
             if near[start : start + MOST_SCANS].mean() >= _LEAST_MAPPED:

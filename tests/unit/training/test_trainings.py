@@ -15,7 +15,7 @@ from ngo_estimator.ngo.loop_judge import EVIDENCE
 from training.common.records import RunError
 from training.data.worlds import world_named
 from training.recordings.recording_source import RecordedArguments
-from training.train_familiarity import Seen, dishonest, fit
+from training.train_familiarity import Seen, fit, inconsistent
 from training.train_loop_judge import Arguments as JudgeArguments
 from training.train_loop_judge import Judged, learn
 from training.train_place import Arguments, PlaceTraining, initial_networks
@@ -85,8 +85,8 @@ def test_an_unknown_step_is_a_step_of_the_robot_and_limits_of_few_drives_have_a_
 
 
 def test_faults_that_stay_outside_of_their_deviations_are_named() -> None:
-    assert dishonest({"noise": 0.98, "black": 0.9}) == "black (90.0%)"
-    assert dishonest({"noise": 0.97}) == dishonest({}) == ""
+    assert inconsistent({"noise": 0.98, "black": 0.9}) == "black (90.0%)"
+    assert inconsistent({"noise": 0.97}) == inconsistent({}) == ""
 
 
 def test_it_learns_which_loops_are_true_and_how_far_off_these_are() -> None:

@@ -85,7 +85,7 @@ class PolicyView:
     pictures: uint8 (pictures, height, width), the newest first. senses: float32 (8,), 1 for the last of the three
     actions; the motion since it was decided on: m forward, m to the left, rad counter-clockwise; and in units of 10 m
     the way since the last bend and the way before that bend, because at the end of a corridor its length is not to be
-    seen. A bend is where the heading has left that of the last bend by over 45 degrees; ways of less than 2 m belong to
+    seen. A bend is where the heading has left that of the last bend by over 45 degrees; runs of less than 2 m belong to
     it. At the first decision all senses are 0.
     """
 
@@ -112,8 +112,8 @@ class PolicyView:
                 if self._run_m >= _SHORTEST_RUN_M:
                     self._earlier_run_m = self._run_m
                 self._bend_yaw, self._run_m = yaw, 0.0
-            ways = self._run_m / _RUN_UNIT_M, self._earlier_run_m / _RUN_UNIT_M
-            self.senses[ACTIONS:] = cos * dx + sin * dy, cos * dy - sin * dx, turned, *ways
+            runs = self._run_m / _RUN_UNIT_M, self._earlier_run_m / _RUN_UNIT_M
+            self.senses[ACTIONS:] = cos * dx + sin * dy, cos * dy - sin * dx, turned, *runs
         self._last_pose = x, y, yaw
         self.pictures[1:] = self.pictures[:-1].copy()
         self.pictures[0] = picture

@@ -13,7 +13,7 @@ from ngo_estimator.frontend.camera.familiarity_watch import FamiliarityWatch
 from ngo_estimator.frontend.camera.local_odometry import LocalEstimate, LocalOdometry
 from tests.golden.drives import WEIGHTS, WORLDS, GoldenDrive
 from training.data.faults import SensedDrive, faulted
-from training.scoring.honesty import estimates_of, odometry_covariances
+from training.scoring.consistency import estimates_of, odometry_covariances
 from training.scoring.metrics import within
 
 BEGIN = 60

@@ -1,4 +1,4 @@
-"""How honest deviations are: shares of poses whose truth lies within three of their own deviations."""
+"""How consistent deviations are: shares of poses whose truth lies within three of their own deviations."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ _STAMP_NS = 1_000_000_000
 
 
 @dataclass(frozen=True)
-class HonestRun:
+class ConsistencyRun:
     """One drive through both estimators.
 
     ``odometry_m``, ``corrected_m``: position RMSE. ``within_odometry``, ``within_published``: shares of the poses of
@@ -50,14 +50,14 @@ def estimates_of(local: LocalOdometry, drive: SensedDrive) -> list[LocalEstimate
     return found
 
 
-def honest_run(local: LocalOdometry, online: OnlineTrajectory, drive: SensedDrive) -> HonestRun:
+def consistency_run(local: LocalOdometry, online: OnlineTrajectory, drive: SensedDrive) -> ConsistencyRun:
     """Run a drive through both estimators, which begin anew."""
     truth = seen_from_first(drive.poses_xyyaw)[1:]
     steps = estimates_of(local, drive)
     run = online_run(online, steps)
     odometry = np.stack([step.odom_xyyaw for step in steps])
     of_odometry = odometry_covariances(odometry, steps)
-    return HonestRun(
+    return ConsistencyRun(
         position_rmse_m(odometry, truth),
         position_rmse_m(run.trajectory.poses_xyyaw[1:], truth),
         within(odometry, of_odometry, truth),
