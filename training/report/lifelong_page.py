@@ -29,6 +29,8 @@ _JOIN_COLUMNS = (
 
 _YEAR_COLUMNS = (
     Column("ate_m", "Error, m", number),
+    Column("drive_ate_m", "of the drive by itself, m", number),
+    Column("alone_ate_m", "where it is mapped alone, m", number),
     Column("iou", "IoU of free cells", number),
     Column("iou_of_sums", "where all scans count alike", number),
     Column("occupied_iou", "IoU of occupied cells", number),
@@ -56,8 +58,9 @@ another odometry: the state that was saved is loaded, the robot is looked for in
 with `map_changes:=learn`. From {settings[most_scans]} key scans on, old ones leave the graph.
 
 - Error: root mean square distance of the drive's positions, from where the robot was found on. The whole map is laid
-  on the truth by one rigid motion. A drive in which the robot was never found has none: means and intervals are over
-  the others.
+  on the truth by one rigid motion, so that it grows with the map. By itself: this part of the drive is laid on the
+  truth. Alone: this part, laid likewise, where the drive makes a map of its own. A drive in which the robot was never
+  found has none: means and intervals are over the others.
 - IoU: of the cells of `/map` with those that exact rays from the true poses of its scans see in the building as it is
   at the end of the drive, with each door as it was at the scan. Cells have 5 cm: of the thin lines of occupied ones
   noise alone makes many differ. Where all scans count alike, older ones are not bounded.
@@ -72,6 +75,8 @@ _YEAR_RATIOS = {
     "memory_mb": "memory over that of drives 11 to 20",
     "ms_a_scan": "time a scan over that of drives 11 to 20",
     "ate_m": "error over that of the first ten",
+    "drive_ate_m": "error of drives by themselves over that of the first ten",
+    "of_alone": "over that of the same drives alone",
 }
 
 _FLEETS = """## Several robots on one map

@@ -30,7 +30,7 @@ from training.data.lidar_drives import TruePoses
 from training.data.year_drives import YearDrive, year_drive
 from training.scoring.lidar_rows import DriveRuns, Pipeline
 from training.scoring.map_errors import intersections
-from training.scoring.metrics import position_rmse_m, rigid_motion
+from training.scoring.metrics import absolute_error_m, position_rmse_m, rigid_motion
 from training.scoring.table import Measured, Numbers, intervals, read, write
 
 IN_TIME, MOST_SCANS = 50, 300
@@ -63,7 +63,8 @@ class Year:
 def patrol(year: Year, identity: str) -> Measured:
     """All numbers of each drive ``(drives,)``; NaN where a drive has none.
 
-    ``ate_m``: error of the drive's poses from where the robot was found on, in the map as a whole.
+    ``ate_m``: error of the drive's poses from where the robot was found on, in the map as a whole; ``drive_ate_m`` with
+    that part of the drive aligned by itself, and ``alone_ate_m`` of the same part where the drive is mapped alone.
     ``iou``: of the map's free cells with those of the building as it is now, and ``occupied_iou`` of the others; with
     ``_of_sums`` where all scans count alike.
     ``ms_a_scan``: computing time of odometry and correction, and ``map_ms_a_scan`` of the map. ``memory_mb``: size of
@@ -101,9 +102,10 @@ def year_numbers(years: Sequence[Measured]) -> dict[str, Numbers]:
 
 def year_ratios(years: Sequence[Measured]) -> Numbers:
     """Numbers of the last ten drives as a share of what they are compared with, one of each year; none of a year in
-    which both are the same drives."""
+    which both are the same drives. ``of_alone``: of the error of each drive, that of the same drive alone."""
     last, found = _ROWS["last_ten"], {}
-    for key, row in (("memory_mb", "eleven_to_twenty"), ("ms_a_scan", "eleven_to_twenty"), ("ate_m", "first_ten")):
+    second, first = "eleven_to_twenty", "first_ten"
+    for key, row in (("memory_mb", second), ("ms_a_scan", second), ("ate_m", first), ("drive_ate_m", first)):
         before = _ROWS[row]
         both = [
             (_of([year], key, last), _of([year], key, before))
@@ -111,7 +113,8 @@ def year_ratios(years: Sequence[Measured]) -> Numbers:
             if len(year.errors[key]) >= 10 + (before.stop or 0)
         ]
         found[key] = np.array([a.mean() / b.mean() for a, b in both if len(a) and len(b)])
-    return intervals(found)
+    two = [[_of([year], key, last).mean() for key in ("drive_ate_m", "alone_ate_m")] for year in years]
+    return intervals(found | {"of_alone": np.array([own / alone for own, alone in two])})
 
 
 def year_least(years: Sequence[Measured]) -> dict[str, float]:
@@ -134,7 +137,8 @@ class _Drive:
         reference = self._drive.measured.reference
         assert isinstance(reference, TruePoses)
         self._truth = reference
-        self._front = DriveRuns(self._drive.measured, year.weights).front(Pipeline())
+        self._runs = DriveRuns(self._drive.measured, year.weights)
+        self._front = self._runs.front(Pipeline())
         self._map, self._map_s = ScanMap(), 0.0
         config = replace(read_lidar_file(year.weights, "graph", ScanGraphConfig), most_scans=year.most_scans)
         self._session = Session("scan", ScanTrajectory(config), MapOrigin(np.zeros(3)), SmoothedCorrection(0.0))
@@ -157,8 +161,12 @@ class _Drive:
         numbers["nodes"] = float(len(graph.ids))
         if joined is not None:
             own = np.flatnonzero(trajectory.stamps_ns >= joined)
-            truth = se2.compose(self._map_from_truth(), self._truth_at(trajectory.stamps_ns[own]))
-            numbers["ate_m"] = position_rmse_m(trajectory.poses_xyyaw[own], truth)
+            stamps_ns, poses = trajectory.stamps_ns[own], trajectory.poses_xyyaw[own]
+            truth, alone = self._truth_at(stamps_ns), self._runs.run(Pipeline()).trajectory
+            numbers["ate_m"] = position_rmse_m(poses, se2.compose(self._map_from_truth(), truth))
+            numbers["drive_ate_m"] = absolute_error_m(poses, truth)
+            same = np.searchsorted(alone.stamps_ns, stamps_ns)
+            numbers["alone_ate_m"] = absolute_error_m(alone.poses_xyyaw[same], truth)
         numbers["false_claims"] = float(self._false)
         drawn = self._map_errors(numbers)
         numbers["memory_mb"] = self._save()

@@ -24,11 +24,13 @@ def test_the_motion_between_maps_is_found_again() -> None:
 
 
 def a_year(drives: int) -> Measured:
-    """Its drive number ``n`` has the error n, needs n + 1 MB, and was not found at all where n is 5."""
+    """Its drive number ``n`` has the error n, 2 n alone, needs n + 1 MB, and was not found at all where n is 5."""
     number = np.arange(float(drives))
     empty = {f"{when}_{kind}": np.zeros((2, 2), np.int8) for kind in ("found", "true") for when in _WHEN}
     corners = {f"{when}_corners": np.zeros((2, 2)) for when in _WHEN}
-    errors = {"ate_m": np.where(number == 5.0, np.nan, number), "memory_mb": number + 1.0, "ms_a_scan": number + 1.0}
+    error_m = np.where(number == 5.0, np.nan, number)
+    errors = {"ate_m": error_m, "drive_ate_m": error_m, "alone_ate_m": 2.0 * error_m}
+    errors |= {"memory_mb": number + 1.0, "ms_a_scan": number + 1.0}
     return Measured({**errors, "iou": 1.0 - 0.5 * (number == 7.0), "occupied_iou": 0.0 * number}, {**empty, **corners})
 
 
@@ -51,6 +53,7 @@ def test_the_table_has_ten_drives_a_row_and_keeps_what_is_not_measured(
     means = [row["ate_m"]["mean"] for row in result["tables"]["year"].values()]
     assert means == pytest.approx([40.0 / 9.0, 14.5, 24.5])
     assert result["year"]["ratios"]["memory_mb"]["mean"] == pytest.approx(25.5 / 15.5)
+    assert result["year"]["ratios"]["of_alone"]["mean"] == 0.5
     assert result["year"]["least"] == {"iou": 0.5}
     page = (tmp_path / "docs" / "results_lifelong.md").read_text()
     assert page.count("| last ten | 24.5 ") == 2 and "after any drive is 0.500." in page
@@ -62,6 +65,8 @@ def test_a_year_goes_on_from_what_is_on_disk(tmp_path: Path, monkeypatch: pytest
     first = patrol(year, "toy")
     longer = patrol(dataclasses.replace(year, drives=2), "toy")
     assert longer.errors["ate_m"][0] == first.errors["ate_m"][0] < 0.1
+    # A map of one drive is that drive, and is laid on the truth as it is.
+    assert first.errors["drive_ate_m"][0] == pytest.approx(first.errors["alone_ate_m"][0], rel=0.01)
     assert longer.errors["iou"][0] > 0.8
     assert longer.errors["nodes"][1] >= longer.errors["nodes"][0] > 20
     assert longer.drawn.keys() == a_year(2).drawn.keys()
