@@ -1,6 +1,5 @@
 """What people do with ngo_node: start and stop it, ask and tell it things, and run several of it."""
 
-import signal
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -25,7 +24,7 @@ from ngo_estimator.slam.map_origin import MapOrigin
 from ngo_estimator.slam.tf_smoothing import SmoothedCorrection
 from ngo_estimator.trajectory.g2o import PlanarGraph, read_g2o
 
-from .processes import NodeProcess, Probe
+from .processes import NodeProcess, Probe, end
 from .readings import xyyaw
 from .relative_poses import Optimizer, assert_pose_is
 
@@ -42,9 +41,7 @@ def parameters(weights: Path, tmp_path_factory: pytest.TempPathFactory) -> dict[
 def optimizer(weights: Path, parameters: dict[str, Any]) -> Iterator[Optimizer]:
     with Probe() as probe, NodeProcess("ngo_estimator", "ngo_node", parameters) as process:
         yield Optimizer(process, weights, probe)
-        process.send(signal.SIGINT)
-        assert process.wait() == 0, process.log
-        assert "Traceback" not in process.log, process.log
+        end(process)
 
 
 # ---- services
@@ -338,9 +335,7 @@ def test_without_autostart_it_does_what_it_is_told(weights: Path, parameters: di
             drive = optimizer.drive()
             assert_pose_is(optimizer.pose_after(*drive.steps(1, 5)), optimizer.expected(drive.steps(1, 5)))
             assert node.change(Transition.TRANSITION_ACTIVE_SHUTDOWN) and node.state() == "finalized"
-            process.send(signal.SIGINT)
-            assert process.wait() == 0, process.log
-            assert "Traceback" not in process.log, process.log
+            end(process)
 
 
 # ---- several robots

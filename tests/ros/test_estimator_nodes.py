@@ -27,7 +27,7 @@ from ngo_estimator.nodes.path_message import plain_path
 from ngo_estimator.slam.online_trajectory import OnlineTrajectory
 
 from .estimator_graph import FIRST_RUN_NS, STEP_NS, Graph, image_message, scan
-from .processes import NodeProcess, Probe, wait_until
+from .processes import NodeProcess, Probe, end, wait_until
 
 pytestmark = pytest.mark.processes
 
@@ -222,11 +222,7 @@ def test_sigint_ends_both_with_code_zero_and_no_traceback(graph: Graph) -> None:
     """Last of those that share the pair."""
     graph.start_run()
     graph.play(*range(100))  # signals come while they work
-    for process in (graph.local, graph.ngo):
-        process.send(signal.SIGINT)
-    for process in (graph.local, graph.ngo):
-        assert process.wait() == 0, process.log
-        assert "Traceback" not in process.log, process.log
+    end(graph.local, graph.ngo)
 
 
 def test_switches_names_and_the_3d_world(weights: Path) -> None:
@@ -284,11 +280,7 @@ def test_switches_names_and_the_3d_world(weights: Path) -> None:
             assert not {"/tf", "/red/odom"} & published()
         (info,) = probe.node.get_subscriptions_info_by_topic("/red/camera/image")
         assert info.qos_profile.reliability == ReliabilityPolicy.BEST_EFFORT
-        for process in (local, ngo):
-            process.send(signal.SIGTERM)
-        for process in (local, ngo):
-            assert process.wait() == 0, process.log
-            assert "Traceback" not in process.log, process.log
+        end(local, ngo, by=signal.SIGTERM)
 
 
 def test_a_signal_while_a_node_starts_ends_it_cleanly(weights: Path) -> None:
@@ -300,9 +292,7 @@ def test_a_signal_while_a_node_starts_ends_it_cleanly(weights: Path) -> None:
                 lambda: ("ngo_node", "/early") in probe.node.get_node_names_and_namespaces(),
                 "the node",
             )
-            process.send(signal.SIGINT)
-            assert process.wait() == 0, process.log
-            assert "Traceback" not in process.log, process.log
+            end(process)
 
 
 def assert_refused(process: NodeProcess, pattern: str) -> None:

@@ -69,8 +69,7 @@ def test_lost_steps_become_a_gap_that_is_flagged_and_has_a_large_covariance(opti
 
 def test_while_lost_covariance_and_diagnostics_say_so(optimizer: Optimizer) -> None:
     drive = optimizer.drive()
-    optimizer.publish(*drive.steps(1, 2))
-    optimizer.wait_for_stamp(drive.stamp_ns(2))
+    optimizer.pose_after(*drive.steps(1, 2))
     far = drive.step(9003)  # a quarter of an hour later
     optimizer.publish(far)
     pose = optimizer.wait_for_stamp(drive.stamp_ns(9003))
@@ -104,12 +103,10 @@ def test_a_stream_that_ends_with_a_meta_pose_leaves_the_whole_path_optimised(opt
 def test_time_that_jumps_back_is_a_clean_reset(optimizer: Optimizer) -> None:
     """A bag that is played in a loop: the same stamps, the same origin."""
     drive = optimizer.drive()
-    optimizer.publish(*drive.steps(1, 30))
-    once = optimizer.wait_for_stamp(drive.stamp_ns(30))
+    once = optimizer.pose_after(*drive.steps(1, 30))
     restarts = optimizer.count("restarts")
     optimizer.poses.clear()
-    optimizer.publish(*drive.steps(1, 30))
-    again = optimizer.wait_for_stamp(drive.stamp_ns(30))
+    again = optimizer.pose_after(*drive.steps(1, 30))
     assert len(optimizer.poses) == 30
     assert again == once
     optimizer.wait_for_value("restarts", lambda value: int(value) == restarts + 1)
@@ -123,14 +120,12 @@ def test_a_publisher_of_another_qos_is_named(optimizer: Optimizer) -> None:
         assert "nothing comes from" in message, message
         optimizer.process.wait_for_log("WARN.*nothing comes from /careless_odometry on '/relative_pose'")
     drive = optimizer.drive()
-    optimizer.publish(*drive.steps(1, 2))
-    optimizer.wait_for_stamp(drive.stamp_ns(2))
+    optimizer.pose_after(*drive.steps(1, 2))
 
 
 def test_of_two_publishers_the_first_is_held_and_both_are_named(optimizer: Optimizer) -> None:
     intruder, drive = optimizer.drive(seed=7), optimizer.drive()
-    optimizer.publish(*drive.steps(1, 3))
-    optimizer.wait_for_stamp(drive.stamp_ns(3))
+    optimizer.pose_after(*drive.steps(1, 3))
     with Probe("second_odometry") as other:
         publisher = other.node.create_publisher(RelativePose, "relative_pose", 5000)
         other.spin_until(lambda: publisher.get_subscription_count() == 1, "a match")
@@ -175,15 +170,13 @@ def test_a_subscriber_that_stalls_holds_nobody_up(optimizer: Optimizer) -> None:
             lambda: optimizer.probe.node.count_subscribers("ngo/path") == others + 1, "the listener"
         )
         drive = optimizer.drive()
-        optimizer.publish(*drive.steps(1, 8))
-        optimizer.wait_for_stamp(drive.stamp_ns(8))
+        optimizer.pose_after(*drive.steps(1, 8))
         assert listener.stdout is not None and int(listener.stdout.readline()) > 0
         listener.send_signal(signal.SIGSTOP)
         took_s = []
         for step in range(9, 400):
             started = time.monotonic()
-            optimizer.publish(drive.step(step))
-            optimizer.wait_for_stamp(drive.stamp_ns(step))
+            optimizer.pose_after(drive.step(step))
             took_s.append(time.monotonic() - started)
         assert sorted(took_s)[-3] < 1.0, "a busy machine may hold up one or two"
         assert optimizer.stamps_ns() == [drive.stamp_ns(step) for step in range(1, 400)]
@@ -215,8 +208,7 @@ def test_slow_and_fast_input_is_taken_whole_and_the_path_keeps_its_pace(optimize
 
 def test_silence_is_said(optimizer: Optimizer) -> None:
     drive = optimizer.drive()
-    optimizer.publish(*drive.steps(1, 3))
-    optimizer.wait_for_stamp(drive.stamp_ns(3))
+    optimizer.pose_after(*drive.steps(1, 3))
     optimizer.diagnostics.clear()
     optimizer.probe.spin_until(
         lambda: any(
@@ -269,8 +261,7 @@ def test_a_clock_that_stands_still_or_jumps_stops_nothing(weights: Path, paramet
             for clock_s in (0, 100, 100, 3):
                 clock.publish(Clock(clock=to_time(clock_s * 10**9)))
                 drive = optimizer.drive()
-                optimizer.publish(*drive.steps(1, 12))
-                pose = optimizer.wait_for_stamp(drive.stamp_ns(12))
+                pose = optimizer.pose_after(*drive.steps(1, 12))
                 assert_pose_is(pose, optimizer.expected(drive.steps(1, 12)))
                 probe.spin_until(lambda: paths and to_ns(paths[-1].header.stamp) == drive.stamp_ns(12), "the path")  # noqa: B023
                 optimizer.wait_for_value("frames", "13".__eq__)
@@ -286,7 +277,6 @@ def test_nothing_is_left_of_a_burst_of_rubbish(optimizer: Optimizer) -> None:
     lines = len(optimizer.process.lines)
     optimizer.publish(*(RelativePose() for _ in range(500)))
     drive = optimizer.drive()
-    optimizer.publish(*drive.steps(1, 2))
-    optimizer.wait_for_stamp(drive.stamp_ns(2))
+    optimizer.pose_after(*drive.steps(1, 2))
     assert len(optimizer.poses) == 2
     assert len(optimizer.process.lines) <= lines + 3, optimizer.process.log

@@ -24,7 +24,7 @@ from ngo_estimator.nodes.messages import pose_message, relative_pose_message, to
 from ngo_estimator.nodes.ngo_node import NgoNode
 from tests.golden.drives import WEIGHTS, GoldenDrive, estimates
 
-from .processes import NodeProcess, Probe
+from .processes import NodeProcess, Probe, end
 from .readings import xyyaw
 from .relative_poses import Optimizer
 
@@ -92,9 +92,7 @@ def again(mapped: Mapped) -> Iterator[Again]:
         with NodeProcess("ngo_estimator", "ngo_node", parameters) as process:
             node = Node(process, WEIGHTS / "maze2d", probe)
             yield Again(**vars(mapped), process=process, probe=probe, optimizer=node, transforms=transforms)
-            process.send(signal.SIGINT)
-            assert process.wait() == 0, process.log
-            assert "Traceback" not in process.log, process.log
+            end(process)
 
 
 def test_another_start_is_found_in_the_loaded_map_which_then_grows(mapped: Mapped) -> None:
@@ -139,9 +137,7 @@ def test_another_start_is_found_in_the_loaded_map_which_then_grows(mapped: Mappe
         assert probe.call(Reset, "ngo_node/reset", Reset.Request()).message == f"forgot {frames} poses"
         node.publish(later[0])
         assert np.hypot(*xyyaw(node.wait_for_stamp(_stamp_ns(later[0])))[:2]) < 0.5
-        process.send(signal.SIGINT)
-        assert process.wait() == 0, process.log
-        assert "Traceback" not in process.log, process.log
+        end(process)
 
 
 def test_a_map_that_learns_grows_from_where_the_robot_is_and_outlives_a_reset(mapped: Mapped) -> None:
@@ -169,9 +165,7 @@ def test_a_map_that_learns_grows_from_where_the_robot_is_and_outlives_a_reset(ma
         fourth = _later(mapped.steps[0], 5)
         node.publish(fourth)
         assert np.hypot(*(xyyaw(node.wait_for_stamp(_stamp_ns(fourth))) - given)[:2]) < 0.5
-        process.send(signal.SIGINT)
-        assert process.wait() == 0, process.log
-        assert "Traceback" not in process.log, process.log
+        end(process)
 
 
 @pytest.fixture

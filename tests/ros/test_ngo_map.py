@@ -16,7 +16,7 @@ from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 
 from ngo_estimator.data.relative_step import KeyScanStep, RelativeStep
 from ngo_estimator.geometry.key_scan import KeyScan
-from ngo_estimator.geometry.planar_motion import between, compose
+from ngo_estimator.geometry.planar_motion import between, compose, transformed
 from ngo_estimator.mapping.occupancy_grid import OccupancyMap
 from ngo_estimator.mapping.scan_map import ScanMap, ScanMapConfig
 from ngo_estimator.mapping.scan_source import KeyScans
@@ -290,10 +290,7 @@ def test_the_map_of_a_maze_shows_its_walls() -> None:
     rows, columns = np.nonzero(values >= 0)
     centres = np.column_stack((columns, rows)) + 0.5
     in_map = centres * info.resolution + [info.origin.position.x, info.origin.position.y]
-    cos, sin = np.cos(first[2]), np.sin(first[2])
-    in_maze = first[:2] + np.column_stack(
-        (cos * in_map[:, 0] - sin * in_map[:, 1], sin * in_map[:, 0] + cos * in_map[:, 1])
-    )
+    in_maze = transformed(first, in_map)
     blocks = np.floor(in_maze / maze.maze.block_m).astype(int)
     away = np.abs(in_maze / maze.maze.block_m - np.rint(in_maze / maze.maze.block_m)).min(axis=1) * maze.maze.block_m
     free = values[rows, columns] == 0

@@ -15,7 +15,7 @@ from ngo_estimator.nodes.messages import relative_step, trajectory_message
 from ngo_estimator.slam.map_origin import MapOrigin
 from ngo_estimator.slam.online_trajectory import OnlineTrajectory
 
-from .processes import NodeProcess, Probe
+from .processes import NodeProcess, Probe, end
 from .relative_poses import Drive, Optimizer
 from .test_control import Managed
 
@@ -108,9 +108,7 @@ class Loaded:
 def loaded(weights: Path, parameters: dict[str, Any], drive: Drive) -> Iterator[Loaded]:
     with Probe() as probe, NodeProcess("ngo_estimator", "ngo_node", {**parameters, "state": "office"}) as process:
         yield Loaded(process, probe, weights)
-        process.send(signal.SIGINT)
-        assert process.wait() == 0, process.log
-        assert "Traceback" not in process.log, process.log
+        end(process)
 
 
 def test_another_process_goes_on_as_if_the_first_had_never_stopped(loaded: Loaded, drive: Drive) -> None:

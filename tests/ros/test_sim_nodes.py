@@ -23,7 +23,7 @@ from ngo_sim.episodes import Episode, record_episode
 from ngo_sim.maze2d import Maze2D
 from ngo_sim.maze3d import Maze3D
 
-from .processes import NodeProcess, Probe, wait_until
+from .processes import NodeProcess, Probe, end, wait_until
 from .readings import stamps_ns, xyyaw
 
 pytestmark = pytest.mark.processes
@@ -226,9 +226,7 @@ def test_a_start_is_told_in_one_line_and_a_signal_ends_it(probe: Probe) -> None:
         )
         received = stamps_ns(images)
         assert before < received[0] and received == sorted(set(received)) and received[-1] < time.time_ns()
-        node.send(signal.SIGTERM)
-        assert node.wait() == 0, node.log
-        assert "Traceback" not in node.log
+        end(node, by=signal.SIGTERM)
 
 
 def test_a_killed_maze3d_takes_its_engine_along_and_leaves_no_files(

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from ngo_estimator.geometry.planar_motion import chained
 from ngo_estimator.trajectory.errors import (
     RelativeDelta,
     Summary,
@@ -31,13 +32,7 @@ def drive(count: int, seed: int, noise: float) -> tuple[np.ndarray, np.ndarray]:
     rng = np.random.default_rng(seed)
     speed = np.where(np.arange(count) % 50 < 8, 0.0, rng.uniform(0.1, 0.3, count))
     steps = np.column_stack((speed, rng.normal(0.0, 0.02, count), rng.normal(0.02, 0.1, count)))
-    truth, estimate = np.zeros((count, 3)), np.zeros((count, 3))
-    for poses, moved in ((truth, steps), (estimate, steps + rng.normal(0.0, noise, steps.shape))):
-        for k in range(1, count):
-            x, y, yaw = poses[k - 1]
-            dx, dy, turn = moved[k]
-            poses[k] = x + np.cos(yaw) * dx - np.sin(yaw) * dy, y + np.sin(yaw) * dx + np.cos(yaw) * dy, yaw + turn
-    return truth, estimate
+    return chained(steps[1:]), chained(steps[1:] + rng.normal(0.0, noise, steps.shape)[1:])
 
 
 def in_space(poses: SpatialPoses, seed: int) -> SpatialPoses:

@@ -9,6 +9,7 @@ import pytest
 from scipy.stats import multivariate_normal
 
 from ngo_estimator.frontend.lidar.mixture_config import MixtureConfig
+from ngo_estimator.geometry import se2
 from ngo_estimator.geometry.scan_points import Mounting
 from ngo_estimator.graph.corrector import GraphProblem
 from ngo_estimator.graph.relative_poses import RelativePoses
@@ -86,24 +87,12 @@ SQUARE_NS = np.array((10, 11, 12, 13)) * 10**9
 SQUARE = np.array(((0.0, 0.0, 0.0), (2.0, 0.0, math.pi / 2), (2.0, 2.0, math.pi), (0.0, 2.0, -math.pi / 2)))
 
 
-def turned(poses: np.ndarray, x: float, y: float, yaw: float) -> np.ndarray:
-    cosine, sine = math.cos(yaw), math.sin(yaw)
-    return np.stack(
-        (
-            x + cosine * poses[:, 0] - sine * poses[:, 1],
-            y + sine * poses[:, 0] + cosine * poses[:, 1],
-            poses[:, 2] + yaw,
-        ),
-        axis=-1,
-    )
-
-
 def test_the_best_alignment_takes_a_rigid_motion_out() -> None:
-    assert absolute_error_m(turned(SQUARE, 3.0, -7.0, 2.5), SQUARE) == pytest.approx(0.0, abs=1e-12)
+    assert absolute_error_m(se2.compose(np.array((3.0, -7.0, 2.5)), SQUARE), SQUARE) == pytest.approx(0.0, abs=1e-12)
 
 
 def test_truth_gives_three_errors_and_a_mapper_one() -> None:
-    estimate = turned(SQUARE, 5.0, 5.0, 1.0)
+    estimate = se2.compose(np.array((5.0, 5.0, 1.0)), SQUARE)
     found = lidar_errors(TruePoses(SQUARE_NS, SQUARE), SQUARE_NS, estimate)
     assert {name: values.shape for name, values in found.items()} == {
         "ate_m": (1,), "position_rmse_m": (1,), "heading_rmse_deg": (1,)

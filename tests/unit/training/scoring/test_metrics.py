@@ -5,6 +5,7 @@ import dataclasses
 import numpy as np
 import pytest
 
+from ngo_estimator.geometry import se2
 from training.data.worlds import WORLDS, world_named
 from training.scoring.metrics import trajectory_error
 from training.scoring.prefix_errors import prefix_errors, stacked
@@ -16,9 +17,7 @@ STRAIGHT = np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [2.0, 0.0, 0.0], [4.0, 0.
 
 
 def moved(poses: np.ndarray, x: float, y: float, yaw: float) -> np.ndarray:
-    cos, sin = np.cos(yaw), np.sin(yaw)
-    xy = poses[:, :2] @ np.array([[cos, sin], [-sin, cos]]) + [x, y]
-    return np.column_stack((xy, poses[:, 2] + yaw))
+    return se2.compose(np.array((x, y, yaw)), poses)
 
 
 def test_errors_on_paper() -> None:

@@ -10,6 +10,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from ngo_estimator.geometry import se2
 from training.data.lidar_drives import Relations
 from training.scoring.relations import interpolated, relation_errors
 
@@ -67,15 +68,7 @@ def test_no_alignment_matters(x: float, y: float, yaw: float, seed: int) -> None
     rng = np.random.default_rng(seed)
     stamps, poses = np.arange(20.0), np.cumsum(rng.normal(0.0, 0.3, (20, 3)), axis=0)
     wanted = relations(*((0.5 * k, 0.5 * k + 3.3, *rng.normal(0.0, 0.5, 3)) for k in range(12)))
-    cosine, sine = math.cos(yaw), math.sin(yaw)
-    moved = np.stack(
-        (
-            x + cosine * poses[:, 0] - sine * poses[:, 1],
-            y + sine * poses[:, 0] + cosine * poses[:, 1],
-            poses[:, 2] + yaw,
-        ),
-        axis=-1,
-    )
+    moved = se2.compose(np.array((x, y, yaw)), poses)
     before, after = (relation_errors(wanted, stamps, each) for each in (poses, moved))
     np.testing.assert_allclose(after.translation_m, before.translation_m, atol=1e-9)
     np.testing.assert_allclose(after.rotation_deg, before.rotation_deg, atol=1e-9)
