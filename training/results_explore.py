@@ -6,9 +6,9 @@
     python -m training.results --world explore --worlds good_wheels no_wheels --buildings 2 --rows nearest ours
 
 The robot explores in this process, with the same map, follower and limits in all rows. In mazes, buildings and plans it
-knows its true poses. In good_wheels, slipping_wheels and no_wheels it is in buildings, and its poses and its map are
-those of the lidar's estimators. FOLDER holds maps of a map server as NAME.yaml. What is measured is kept in ``runs/``.
-The command writes ``training/results/explore.json``, ``docs/results_explore.md`` and
+knows its true poses. In good_wheels, slipping_wheels, no_wheels and short_range it is in buildings, and its poses and
+its map are those of the lidar's estimators. FOLDER holds maps of a map server as NAME.yaml. What is measured is kept in
+``runs/``. The command writes ``training/results/explore.json``, ``docs/results_explore.md`` and
 ``docs/images/results_explore_*.png``. Kinds of places that it does not measure stay there as they were.
 """
 
@@ -30,7 +30,7 @@ from training.common import records
 from training.common.command_line import check_among, check_at_least
 from training.data import explored_worlds
 from training.data.building_drives import BUILDING_TEST_SEEDS
-from training.data.explored_worlds import WHEELS, Building, ExploredWorld, Maze
+from training.data.explored_worlds import RANGE_M, RANGES_M, WHEELS, Building, ExploredWorld, Maze
 from training.data.worlds import TEST_SEEDS, VALIDATION_SEEDS
 from training.report import explore_page
 from training.report.explore_figures import draw_figures
@@ -63,7 +63,7 @@ _BUILDING_SEEDS = {"validation": range(12_000, 13_000), "test": BUILDING_TEST_SE
 _MAZE_SEEDS = {"validation": VALIDATION_SEEDS, "test": TEST_SEEDS}
 
 
-Kind = Literal["mazes", "buildings", "plans", "good_wheels", "slipping_wheels", "no_wheels"]
+Kind = Literal["mazes", "buildings", "plans", "good_wheels", "slipping_wheels", "no_wheels", "short_range"]
 
 
 @dataclass(frozen=True)
@@ -150,10 +150,11 @@ def _places(kind: str, arguments: Arguments) -> Iterator[tuple[str, str, Callabl
         for seed in _MAZE_SEEDS[arguments.split][: arguments.count]:
             yield f"maze_{seed}", f"maze {seed}", partial(Maze, seed, Maze2DConfig())
     elif kind != "plans":
-        plan, wheels = FloorPlanConfig(scale=arguments.scale, people=0), WHEELS.get(kind)
+        plan = FloorPlanConfig(scale=arguments.scale, people=0)
+        wheels, range_m = WHEELS.get(kind), RANGES_M.get(kind, RANGE_M)
         for seed in _BUILDING_SEEDS[arguments.split][: arguments.buildings]:
-            make = partial(Building, seed, plan, wheels=wheels)
-            yield f"building_{seed}_{arguments.scale:g}", f"building {seed} {plan} {wheels}", make
+            make = partial(Building, seed, plan, wheels=wheels, range_m=range_m)
+            yield f"building_{seed}_{arguments.scale:g}", f"building {seed} {plan} {wheels} {range_m}", make
     else:
         assert arguments.plans is not None
         for path in sorted(arguments.plans.glob("*.yaml")):
@@ -178,7 +179,9 @@ def _measure(
     place: Place, name: str, most_s: float, estimator: Callable[[np.ndarray], Estimator] = TruePosesMap
 ) -> Measured:
     world = place.make()
-    config = ExplorerConfig(rule=name if name in RULES else ExplorerConfig.rule, radius_m=world.radius_m)
+    rule = name if name in RULES else ExplorerConfig.rule
+    # What lies farther away than the lidar sees is not seen from there.
+    config = ExplorerConfig(rule=rule, radius_m=world.radius_m, reach_m=min(ExplorerConfig.reach_m, world.range_m))
     if name == "known_tour":
         run = drive_known_tour(world, place.seen, config, DriveConfig(), most_s)
     else:

@@ -27,14 +27,17 @@ from training.data.lidar_drives import simulated_stamps_ns
 _APART_M = 0.4  # between two places that say what can be seen
 _RAYS = 720
 _GAP_M = 0.05  # between the leaf of a door that is shut and its frame, at most
-_RANGE_M = 12.0  # of the robot's lidar
+RANGE_M = 12.0  # of the exact rays, and of most robots' lidars
 
 WHEELS = {
     "good_wheels": WheelsConfig(left_bias=0.002, right_bias=-0.001, wheel_noise=0.005),
     "slipping_wheels": WheelsConfig(left_bias=0.03, right_bias=0.028, wheel_noise=0.01, slips_per_km=60.0),
     "no_wheels": None,
+    "short_range": None,
 }
 """Wheels of a robot that estimates its poses, by how good they are; None: its lidar is all that it has."""
+RANGES_M = {"short_range": 4.0}
+"""Of a lidar that sees less far than the others: in the middle of a long corridor it sees nothing that moves."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,16 +75,19 @@ class ExploredWorld(Protocol):
 
 
 class Building:
-    """A building of a seed; a robot with a lidar of 270 degrees and 12 m, and with ``wheels`` if it tells of any."""
-
-    range_m = _RANGE_M
+    """A building of a seed; a robot with a lidar of 270 degrees, and with ``wheels`` if it tells of any."""
 
     def __init__(
-        self, seed: int, plan: FloorPlanConfig, speed_mps: float = 1.0, wheels: WheelsConfig | None = None
+        self,
+        seed: int,
+        plan: FloorPlanConfig,
+        speed_mps: float = 1.0,
+        wheels: WheelsConfig | None = None,
+        range_m: float = RANGE_M,
     ) -> None:
         self._driver = BuildingDriverConfig(driver="cmd_vel", speed_mps=speed_mps, acceleration_mps2=1.0)
-        self.radius_m = self._driver.radius_m
-        self._scanner = ScannerConfig(range_max_m=_RANGE_M, rays=360)
+        self.radius_m, self.range_m = self._driver.radius_m, range_m
+        self._scanner = ScannerConfig(range_max_m=range_m, rays=360)
         self._angles = self._scanner.base_angles_rad()
         self._has_wheels = wheels is not None
         self._building = Building2d(plan, self._scanner, wheels or WheelsConfig(), self._driver)
@@ -98,7 +104,7 @@ class Building:
         self._building.command(speed_mps, turn_rate_rps)
         frame = self._building.step()
         # Of rays without a return nothing is known: glass, a dropout, or nothing within the range.
-        scan = range_scan(self._angles, frame.ranges_m.astype(np.float64), np.zeros(3), _RANGE_M)
+        scan = range_scan(self._angles, frame.ranges_m.astype(np.float64), np.zeros(3), self.range_m)
         stamp_ns, wheels_ns = simulated_stamps_ns(np.array((frame.stamp_s, frame.wheel_stamp_s))).tolist()
         wheels = [WheelPose(wheels_ns, frame.wheel_pose_xyyaw)] if self._has_wheels else []
         records: list[LidarScan | WheelPose] = [*wheels, measured_scan(self._scanner, stamp_ns, frame.ranges_m)]
@@ -113,7 +119,7 @@ class Building:
         cells = np.argwhere(area[::step, ::step]) * step
         poses = np.column_stack(((cells[:, ::-1] + 0.5) * CELL_M, np.zeros(len(cells))))
         exact = ScannerConfig(
-            rays=_RAYS, field_of_view_deg=360.0, range_max_m=_RANGE_M, noise_m=0.0, noise_per_m=0.0, dropout=0.0
+            rays=_RAYS, field_of_view_deg=360.0, range_max_m=RANGE_M, noise_m=0.0, noise_per_m=0.0, dropout=0.0
         )
         doors = replace(plan.doors, widths_m=plan.doors.widths_m + _GAP_M)  # nothing is seen behind those that are shut
         swing = np.column_stack((doors.hinges_m, doors.widths_m))
@@ -129,7 +135,7 @@ class Building:
             np.zeros((len(poses), 0, 3)),
             np.random.default_rng(0),
         )
-        return [range_scan(exact.base_angles_rad(), row.astype(float), np.zeros(3), _RANGE_M) for row in ranges], poses
+        return [range_scan(exact.base_angles_rad(), row.astype(float), np.zeros(3), RANGE_M) for row in ranges], poses
 
     def in_reach(self, poses_xyyaw: np.ndarray) -> np.ndarray:
         """By the leaves of the doors where they are now."""

@@ -55,6 +55,7 @@ _KINDS = {
     "good_wheels": "Buildings, good wheels",
     "slipping_wheels": "Buildings, slipping wheels",
     "no_wheels": "Buildings, no wheels",
+    "short_range": "Buildings, no wheels, a lidar of 4 m",
 }
 _POSES = {
     "true": "The robot knows its **true poses**: no row says anything about the error of the estimator.",

@@ -105,6 +105,19 @@ def test_a_robot_in_a_gap_that_is_a_cell_too_narrow_may_leave_on_both_sides() ->
         assert [plan_path(known, field, start, goal, need_m) is not None for goal in goals].count(True) == ways
 
 
+def test_a_path_goes_round_a_gap_that_is_a_little_too_narrow() -> None:
+    walls = np.zeros((81, 121), np.int8)
+    walls[[0, -1]] = walls[:, [0, -1]] = walls[40] = 100
+    walls[40, 20:31] = walls[40, 90:110] = 0  # of 0.55 m, with cells wide enough close by on both sides; and of 1 m
+    known, need_m, start, goal = KnownMap(0.22, 0.6), 0.305, np.array((1.275, 1.0)), np.array((1.275, 3.0))
+    known.update(walls, 0.05, np.zeros(2))
+    field = cost_field(known, start, need_m)
+    path = plan_path(known, field, start, goal, need_m)
+    assert path is not None and path[:, 0].max() > 4.5
+    row, column = (value // known.block for value in known.cell(goal))
+    assert field[row, column] * known.block * known.resolution_m / 10.0 > 6.0, "as far as the way round"
+
+
 def test_a_robot_that_seems_to_stand_in_a_wall_is_on_one_side_of_it() -> None:
     known = known_of(drawn("#" * 22, *[f"#{'.' * 9}##{'.' * 9}#"] * 20, "#" * 22))
     field = cost_field(known, np.array((1.1, 1.1)), NEED_M)

@@ -9,7 +9,9 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from ngo_explorer.known_map import Cells, Floats, KnownMap
+from ngo_explorer.known_map import FREE, Cells, Floats, KnownMap
+
+Wide = NDArray[np.bool_]
 
 _BUCKETS = 64  # above the dearest step between two blocks
 _TIGHT = 20  # tenths that a step costs more where the clearance is the least, and at most
@@ -22,7 +24,8 @@ def cost_field(known: KnownMap, start_xy: Floats, need_m: float) -> NDArray[np.i
     In tenths of a block's side; a step costs up to three times its length where walls are near. By Dijkstra's
     algorithm with buckets (Dial 1969).
     """
-    return np.asarray(_costs(known.roomy_m, need_m, known.comfort_m, _start_blocks(known, start_xy, need_m)))
+    starts = _start_blocks(known, start_xy, need_m)
+    return np.asarray(_costs(_wide(known, need_m), known.block, known.roomy_m, need_m, known.comfort_m, starts))
 
 
 def plan_path(
@@ -33,9 +36,11 @@ def plan_path(
     field: the costs from the robot.
     """
     start, goal = known.cell(start_xy), known.cell(goal_xy)
-    corridor = _corridor(field, goal[0] // known.block, goal[1] // known.block)
-    if corridor is None:
+    last_row, last_column = goal[0] // known.block, goal[1] // known.block
+    rows, columns = field.shape
+    if not (0 <= last_row < rows and 0 <= last_column < columns) or field[last_row, last_column] < 0:
         return None
+    corridor = _corridor(_wide(known, need_m), known.block, field, last_row, last_column)
     row, column = start[0] // known.block, start[1] // known.block
     reach = math.ceil(_ESCAPE_M / (known.block * known.resolution_m))
     corridor[max(0, row - reach) : row + reach + 1, max(0, column - reach) : column + reach + 1] = True
@@ -78,8 +83,43 @@ def _start_blocks(known: KnownMap, start_xy: Floats, need_m: float) -> NDArray[n
     return within if len(within) or not len(found) else found[[np.argmin(away_m)]]
 
 
+def _wide(known: KnownMap, need_m: float) -> Wide:
+    return np.asarray((known.state == FREE) & (known.clearance_m >= need_m))
+
+
+@njit(cache=True)
+def _leads(wide: Wide, block: int, row: int, column: int, r: int, c: int) -> bool:
+    """Whether a way over ``wide`` cells leads from a block into a neighbour; diagonally past the corner or round it.
+
+    That both have such cells is not enough: these may lie on both sides of a gap that is too narrow.
+    """
+    if row == r or column == c:
+        return _passes(wide, block, row, column, r, c)
+    y, x = max(row, r) * block, max(column, c) * block
+    below, left = (1, 0) if r > row else (0, 1), (1, 0) if c > column else (0, 1)
+    if wide[y - below[0], x - left[0]] and wide[y - below[1], x - left[1]]:
+        return True
+    by_row = _passes(wide, block, row, column, r, column) and _passes(wide, block, r, column, r, c)
+    return by_row or (_passes(wide, block, row, column, row, c) and _passes(wide, block, row, c, r, c))
+
+
+@njit(cache=True)
+def _passes(wide: Wide, block: int, row: int, column: int, r: int, c: int) -> bool:
+    """Whether two wide cells touch across the side between two blocks."""
+    y, x = max(row, r) * block, max(column, c) * block
+    for first in range(block):
+        for second in range(max(0, first - 1), min(block, first + 2)):
+            if row == r and wide[y + first, x - 1] and wide[y + second, x]:
+                return True
+            if column == c and wide[y - 1, x + first] and wide[y, x + second]:
+                return True
+    return False
+
+
 @njit(cache=True)
 def _costs(
+    wide: Wide,
+    block: int,
     roomy: NDArray[np.float32],
     need: float,
     comfort: float,
@@ -114,13 +154,10 @@ def _costs(
                 r, c = row + d_row, column + d_column
                 if r < 0 or c < 0 or r >= rows or c >= columns or done[r, c] or roomy[r, c] < need:
                     continue
-                # A diagonal step needs both corners: no cutting through where two walls meet.
-                if d_row != 0 and d_column != 0 and (roomy[row, c] < need or roomy[r, column] < need):
-                    continue
                 tight = 1.0 - min(1.0, (roomy[r, c] - need) / max(comfort - need, 1e-6))
                 step = (14 if d_row != 0 and d_column != 0 else 10) * (10 + int(_TIGHT * tight)) // 10
                 cost = now + step
-                if costs[r, c] >= 0 and costs[r, c] <= cost:
+                if (costs[r, c] >= 0 and costs[r, c] <= cost) or not _leads(wide, block, row, column, r, c):
                     continue
                 costs[r, c] = cost
                 if used == len(entries):
@@ -134,16 +171,9 @@ def _costs(
     return costs
 
 
-def _corridor(field: NDArray[np.int32], row: int, column: int) -> NDArray[np.bool_] | None:
-    """The blocks of the cheapest path to a block and those beside them; None where no path leads there."""
-    rows, columns = field.shape
-    if not (0 <= row < rows and 0 <= column < columns) or field[row, column] < 0:
-        return None
-    return np.asarray(_marked(field, row, column))
-
-
 @njit(cache=True)
-def _marked(field: NDArray[np.int32], row: int, column: int) -> NDArray[np.bool_]:
+def _corridor(wide: Wide, block: int, field: NDArray[np.int32], row: int, column: int) -> Wide:
+    """The blocks of the cheapest path to a block and those beside them."""
     rows, columns = field.shape
     marked = np.zeros((rows, columns), np.bool_)
     while True:
@@ -155,7 +185,7 @@ def _marked(field: NDArray[np.int32], row: int, column: int) -> NDArray[np.bool_
         best, next_row, next_column = field[row, column], row, column
         for r in range(max(0, row - 1), min(rows, row + 2)):
             for c in range(max(0, column - 1), min(columns, column + 2)):
-                if 0 <= field[r, c] < best:
+                if 0 <= field[r, c] < best and _leads(wide, block, row, column, r, c):
                     best, next_row, next_column = field[r, c], r, c
         if next_row == row and next_column == column:
             return marked

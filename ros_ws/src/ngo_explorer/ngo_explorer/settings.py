@@ -20,7 +20,7 @@ class ExplorerConfig(Settings):
     radius_m: float = setting(0.22, "Radius of the robot, m.", minimum=0.02, maximum=2.0)
     margin_m: float = setting(0.05, "Least distance that paths keep from obstacles beside the radius, m.", minimum=0.0)
     comfort_m: float = setting(0.6, "Distance from obstacles below which paths cost more, m.", minimum=0.0, maximum=3.0)
-    reach_m: float = setting(6.0, "Distance up to which a frontier is looked at from afar, m.", minimum=0.3)
+    reach_m: float = setting(6.0, "Longest distance to look at a frontier from: what the robot sees, m.", minimum=0.3)
     frontier_m: float = setting(0.75, "Length of the smallest frontier, m.", minimum=0.0, maximum=10.0)
     gain_m2: float = setting(0.1, "Unknown area that a frontier must show from its viewpoint, m^2.", minimum=0.0)
     gain_range_m: float = setting(4.0, "Distance beyond a frontier up to which unknown area is gain, m.", minimum=0.3)
