@@ -46,11 +46,13 @@ def online_poses(core: OnlineTrajectory, features: dict[str, np.ndarray]) -> np.
 def steps_of(features: dict[str, np.ndarray]) -> Iterator[RelativeStep]:
     """The steps in ``features`` as the local odometry would have given them, a nanosecond apart.
 
-    ``unlikeness`` ``(steps,)`` is taken where it is there; without, all frames are familiar.
+    ``unlikeness`` ``(steps,)`` and ``origin_code`` are optional: without, all frames are familiar, and the first one is
+    no place.
     """
     odometry = se2.r2g(torch.from_numpy(features["relative"]).double()).numpy()
     variances = np.exp(2.0 * features["log_std"].astype(np.float64))
     unlikeness = features.get("unlikeness", np.zeros(len(variances)))
+    origin = features["origin_code"][0].astype(np.float32) if "origin_code" in features else None
     for k, relative in enumerate(features["relative"]):
         yield RelativeStep(
             stamp_ns=k + 1,
@@ -61,7 +63,7 @@ def steps_of(features: dict[str, np.ndarray]) -> Iterator[RelativeStep]:
             odom_xyyaw=odometry[k],
             motion_feature=features["motion"][k].astype(np.float32),
             place_code=features["codes"][k].astype(np.float32),
-            from_place_code=None if k else features["origin_code"][0].astype(np.float32),
+            from_place_code=None if k else origin,
             unlikeness=float(unlikeness[k]),
         )
 

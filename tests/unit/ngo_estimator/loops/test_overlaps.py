@@ -8,7 +8,6 @@ import pytest
 import torch
 from torch import Tensor
 
-from ngo_estimator.data.relative_step import RelativeStep
 from ngo_estimator.geometry import se2
 from ngo_estimator.geometry.scan_registration import Scans
 from ngo_estimator.loops.loop_closure import LoopSearch
@@ -18,6 +17,7 @@ from ngo_estimator.ngo.pose_aggregation import poses_in_blocks
 from ngo_estimator.slam.online_trajectory import OnlineTrajectory
 from tests.unit.ngo_estimator.rooms import CAMERA, camera_pair_head, drive_with_a_camera, seen_by_camera
 from tests.unit.ngo_estimator.samples import small_optimizer, with_origin
+from training.scoring.online_estimate import steps_of
 
 SEARCH = LoopSearch(2, 8, 3, 0, 1, registrations=5, overlaps=20)
 
@@ -151,23 +151,13 @@ def test_without_registrations_there_are_no_overlaps() -> None:
 def online(overlaps: int, window: int, steps: int = 320, first: int = 0) -> float:
     """Position RMSE (m) in the end of what is corrected online from step ``first`` on, where no place is recognised."""
     relative, log_std, codes, truth = drive_with_a_camera(steps)
-    odometry = se2.r2g(relative[0].double()).numpy()
-    covariance = np.diag(torch.exp(2.0 * log_std[0, 0].double()))
+    features = {"relative": relative[0].numpy(), "log_std": log_std[0].numpy(), "codes": codes[0].numpy()}
+    features["motion"] = np.zeros((steps, 6))
     search = dataclasses.replace(SEARCH, most=1, per_pose=2, overlaps=overlaps)
     core = OnlineTrajectory(
         small_optimizer("gauss_newton", iterations=5, search=search), camera_pair_head(), window, key_frames=12
     )
-    for k in range(steps):
-        step = RelativeStep(
-            stamp_ns=k + 1,
-            from_stamp_ns=k,
-            relative_xyyaw=relative[0, k].double().numpy(),
-            covariance=covariance,
-            origin_stamp_ns=0,
-            odom_xyyaw=odometry[k],
-            motion_feature=np.zeros(6, np.float32),
-            place_code=codes[0, k].numpy(),
-        )
+    for k, step in enumerate(steps_of(features)):
         core.update(step, optimize=k >= first)
     trajectory = core.trajectory()
     assert trajectory is not None

@@ -17,6 +17,7 @@ from ngo_estimator.ngo.whole_trajectory import optimize_offline
 from ngo_estimator.slam.online_trajectory import OnlineTrajectory
 from tests.unit.ngo_estimator.rooms import CONFIG, drive_in_the_room, registering_pair_head
 from tests.unit.ngo_estimator.samples import small_optimizer
+from training.scoring.online_estimate import steps_of
 
 STEPS = 96
 SEARCH = LoopSearch(2, 8, 2, 0, 3, registrations=4)
@@ -45,22 +46,10 @@ def test_registered_steps_drift_less(known: bool) -> None:
 
 def relative_steps(steps: int, first_code: bool = True) -> list[RelativeStep]:
     relative, log_std, codes, origin, _ = drive_in_the_room(steps)
-    odometry = se2.r2g(relative.double()).numpy()
-    motion = torch.rand(steps, 6, generator=torch.Generator().manual_seed(1)).numpy()
-    return [
-        RelativeStep(
-            stamp_ns=k + 1,
-            from_stamp_ns=k,
-            relative_xyyaw=relative[k].double().numpy(),
-            covariance=np.diag(np.exp(2.0 * log_std[k].double().numpy())),
-            origin_stamp_ns=0,
-            odom_xyyaw=odometry[k],
-            motion_feature=motion[k],
-            place_code=codes[k].numpy(),
-            from_place_code=origin[0].numpy() if k == 0 and first_code else None,
-        )
-        for k in range(steps)
-    ]
+    motion = torch.rand(steps, 6, generator=torch.Generator().manual_seed(1))
+    features = {"relative": relative, "log_std": log_std, "motion": motion, "codes": codes}
+    features |= {"origin_code": origin} if first_code else {}
+    return list(steps_of({name: values.numpy() for name, values in features.items()}))
 
 
 @pytest.mark.parametrize("first_code", [True, False])

@@ -13,6 +13,7 @@ from ngo_estimator.ngo.neural_graph_optimizer import NeuralGraphOptimizer, Neura
 from ngo_estimator.ngo.pose_aggregation import PoseAggregationConfig
 from ngo_estimator.slam.online_trajectory import OnlineTrajectory
 from tests.unit.ngo_estimator.samples import place_config
+from training.scoring.online_estimate import steps_of
 
 SIDE_STEPS = 100  # of a square that the robot drives round and round
 LAP = 4 * SIDE_STEPS
@@ -55,21 +56,9 @@ def drive(steps: int, bias_rad: float = 3e-4, seed: int = 0) -> tuple[list[Relat
     poses = se2.r2g(torch.from_numpy(true)).numpy()
     poses[:, 2] = np.angle(np.exp(1j * poses[:, 2]))
     relative = true + rng.normal(size=true.shape) * STEP_STD + np.array([0.0, 0.0, bias_rad])
-    odom = se2.r2g(torch.from_numpy(relative)).numpy()
-    covariance = np.diag(STEP_STD**2)
-    return [
-        RelativeStep(
-            stamp_ns=(k + 1) * 1000,
-            from_stamp_ns=k * 1000,
-            relative_xyyaw=relative[k],
-            covariance=covariance,
-            origin_stamp_ns=0,
-            odom_xyyaw=odom[k],
-            motion_feature=np.zeros(1, np.float32),
-            place_code=poses[k].astype(np.float32),
-        )
-        for k in range(steps)
-    ], np.concatenate((np.zeros((1, 3)), poses))
+    log_std = np.tile(np.log(STEP_STD), (steps, 1))
+    features = {"relative": relative, "log_std": log_std, "motion": np.zeros((steps, 1)), "codes": poses}
+    return list(steps_of(features)), np.concatenate((np.zeros((1, 3)), poses))
 
 
 def rmse(poses: np.ndarray, truth: np.ndarray) -> float:

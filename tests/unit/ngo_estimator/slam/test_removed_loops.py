@@ -3,7 +3,6 @@
 import numpy as np
 import pytest
 
-from ngo_estimator.data.relative_step import RelativeStep
 from ngo_estimator.geometry import se2
 from ngo_estimator.graph.corrector import GraphProblem
 from ngo_estimator.graph.robust import Robust
@@ -13,6 +12,7 @@ from ngo_estimator.slam.online_trajectory import OnlineTrajectory
 from ngo_estimator.slam.scan_trajectory import ScanTrajectory
 from ngo_estimator.trajectory.g2o import PlanarGraph
 from tests.unit.ngo_estimator.samples import small_optimizer, small_pair_head, trajectory_inputs
+from training.scoring.online_estimate import steps_of
 
 from .test_scan_trajectory import loop_drive
 
@@ -43,12 +43,9 @@ def lidar() -> ScanTrajectory:
 @pytest.fixture
 def pictures() -> OnlineTrajectory:
     core = OnlineTrajectory(small_optimizer(trained=True), small_pair_head(), 64)
-    relative, log_std, motion, codes = (values[0].double() for values in trajectory_inputs(1, 80))
-    odometry = se2.r2g(relative).numpy()
-    for k in range(80):
-        place, feature = codes[k].float().numpy(), motion[k].float().numpy()
-        covariance = np.diag(np.exp(2.0 * log_std[k].numpy()))
-        core.update(RelativeStep(k + 1, k, relative[k].numpy(), covariance, 0, odometry[k], feature, place))
+    names = ("relative", "log_std", "motion", "codes")
+    for step in steps_of({name: of[0].numpy() for name, of in zip(names, trajectory_inputs(1, 80), strict=True)}):
+        core.update(step)
     return core
 
 
