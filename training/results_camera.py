@@ -5,9 +5,10 @@
     python -m training.results --world camera --named take_cover MAP27
     python -m training.results --world camera --split validation --without corrector
     python -m training.results --world camera --places rooms --seeds 3 --frames 600
+    python -m training.results --world camera --places mazes --seeds 3 --frames 600 --without wheels
 
-A drive of the explorer on each map, or rounds in rooms of another renderer (``room_drives``). The motion given is that
-of wheels with errors (``given_motion``). The command
+A drive of the explorer on each map, drives through mazes, or rounds in rooms of another renderer (``room_drives``). The
+motion given is that of wheels with errors (``given_motion``); without wheels the floor gives the scale. The command
 prints a table and writes ``training/results/camera.json``: each drive, and rows with means over drives. Run it again to
 continue after a stop. Drives of as many frames that are published and that the code of today has not measured stay, and
 name their revision.
@@ -31,7 +32,7 @@ from training.common.command_line import check_at_least, run_command
 from training.data.doom_drives import TEST_MAPS, VALIDATION_MAPS
 from training.report.folders import with_earlier
 from training.scoring import camera_rows, room_drives
-from training.scoring.camera_rows import Ablation, camera_drive, measured
+from training.scoring.camera_rows import Ablation, camera_drive, maze_drive, measured
 from training.scoring.room_drives import room_drive
 from training.scoring.table import Drive, Numbers, Row, Rows, interval_of, measure
 
@@ -48,7 +49,7 @@ _DRIVE_CODE, _ROW_CODE = (episodes, maze3d), (camera_rows, picture_odometry, pic
 class Arguments:
     """Settings of the measurement."""
 
-    places: Literal["doom", "rooms"] = "doom"  # ViZDoom's maps, or rooms of another renderer, in a file of their own.
+    places: Literal["doom", "mazes", "rooms"] = "doom"  # Maps; mazes, rooms of another renderer: own files.
     split: Literal["validation", "test"] = "test"  # Maps to measure on; settings are chosen on validation.
     seeds: int = 1  # Drives of each map, or rooms.
     frames: int = 1000  # Frames of a drive.
@@ -100,9 +101,11 @@ def _drives(arguments: Arguments) -> list[Drive]:
     drives = []
     first, frames = _FIRST_SEED[arguments.split], arguments.frames
     seeds = range(first, first + arguments.seeds)
-    if arguments.places == "rooms":
+    if arguments.places != "doom":
+        make_one, code = (room_drive, _ROOM_CODE) if arguments.places == "rooms" else (maze_drive, _DRIVE_CODE)
+        name = arguments.places.removesuffix("s")
         return [
-            Drive(f"room {seed}", f"room {seed}, {frames} frames", partial(room_drive, seed, frames), _ROOM_CODE)
+            Drive(f"{name} {seed}", f"{name} {seed}, {frames} frames", partial(make_one, seed, frames), code)
             for seed in seeds
         ]
     for number, of in enumerate(_MAPS[arguments.split][: arguments.maps or None]):

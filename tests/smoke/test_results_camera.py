@@ -27,13 +27,14 @@ PUBLISHED = dict.fromkeys(
 PUBLISHED |= {"within_3_std": 1.0, "frames_a_second": 40.0, "loops": 1.0}
 
 
-@pytest.mark.parametrize("without", ["tracks", "points", "planar", "sift", "corrector"])
+@pytest.mark.parametrize("without", ["tracks", "points", "planar", "sift", "corrector", "wheels"])
 def test_an_ablation_has_a_file_of_its_own(without: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(results_camera._MAPS, "test", (("take_cover.wad", "MAP01"),))
     (drive,) = results_camera.main(
         results_camera.Arguments(frames=24, without=without, results=tmp_path, runs=tmp_path / "runs")  # type: ignore[arg-type]
     )["drives"].values()
     assert [path.name for path in tmp_path.glob("*.json")] == [f"camera.no_{without}.json"]
+    assert ("floorless" in drive) == (without == "wheels")
     assert (drive["odometry_ate_m"] == pytest.approx(drive["given_ate_m"])) == (without == "tracks")
     odometry, graph = camera_rows.estimators(camera(), without)
     with camera_rows.solver(without):

@@ -21,6 +21,8 @@ if TYPE_CHECKING:  # live nodes need no files
 # Between these and the robot a transform moves: it says nothing of the robot itself.
 _OUTSIDE = ("odom", "map", "world", "earth")
 _BASE_FRAMES = ("base_link", "base_footprint", "base")
+FLOOR_FRAME = "base_footprint"
+"""Of a robot, where it is on the floor (REP-120)."""
 # How much of /tf is looked through for a scanner that /tf_static does not know.
 _LOOK_NS = 600_000_000_000
 
@@ -90,21 +92,21 @@ def find_mounting(recording: Recording, topics: RecordingTopics, frame: str | No
 
 
 def find_pose(
-    recording: Recording, topics: RecordingTopics, frame: str | None = None
+    recording: Recording, topics: RecordingTopics, frame: str | None = None, *before: str
 ) -> tuple[str, str, Pose, str] | None:
     """The robot's frame, that of a sensor (None: of topics.image), the sensor's pose there, and which topics say it.
 
     Chains of transforms are composed. Those of /tf_static count; where a frame's transform changes, the one that holds
     longest while topics.image is recorded. Where they do not join the two frames, the first transforms of /tf (10 min
     of it) are taken, without those that move the robot itself. The robot's frame is the child of the wheel odometry,
-    else base_link, base_footprint or base, with the robot's prefix where it has one. Topics of transforms in another
-    robot's namespace are left out. None where no transform says it.
+    else one of those before, base_link, base_footprint or base, with the robot's prefix where it has one. Topics of
+    transforms in another robot's namespace are left out. None where no transform says it.
 
     Raises:
         RecordingError: a message that cannot be read.
     """
     scan_frame = _scan_frame(recording, topics) if frame is None else frame
-    bases = [frame for frame in (_wheel_frame(recording, topics), *_BASE_FRAMES) if frame]
+    bases = [frame for frame in (_wheel_frame(recording, topics), *before, *_BASE_FRAMES) if frame]
     tree = TransformBuffer()
     names = transform_topics(recording, topics.image)
     static = [name for name in names if name.endswith("static")]

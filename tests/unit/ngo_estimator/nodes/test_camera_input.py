@@ -6,8 +6,10 @@ from typing import Any
 
 import numpy as np
 import pytest
+from geometry_msgs.msg import TransformStamped
 from nav_msgs.msg import Odometry
 from sensor_msgs.msg import CameraInfo, Image
+from tf2_msgs.msg import TFMessage
 
 from ngo_common.nodes.process import StartError
 from ngo_estimator.data.relative_step import RelativeStep
@@ -17,10 +19,7 @@ from ngo_estimator.nodes.settings import LocalNodeSettings, MapNodeSettings
 from ngo_estimator.nodes.weights import weights_folder
 
 
-def test_a_camera_needs_odometry_and_has_no_map() -> None:
-    node: Any = None
-    with pytest.raises(StartError, match="'robot_odometry' is 'none'; expected 'topic' or 'tf'"):
-        CameraInput(node, LocalNodeSettings(world="camera"), lambda step: None)
+def test_a_camera_has_no_map() -> None:
     with pytest.raises(StartError, match="camera has no weights, and no map"):
         weights_folder(MapNodeSettings(world="camera"))
 
@@ -28,7 +27,7 @@ def test_a_camera_needs_odometry_and_has_no_map() -> None:
 class Robot:
     """Calls an input as its topics would, and keeps what it publishes, logs and drops."""
 
-    def __init__(self) -> None:
+    def __init__(self, robot_odometry: str = "topic") -> None:
         self.published: list[RelativeStep | None] = []
         self.said: list[str] = []
         self.dropped: list[str] = []
@@ -41,7 +40,7 @@ class Robot:
         status: Any = SimpleNamespace(received=lambda stamp_ns: None, dropped=self._drop)
         listening: Any = SimpleNamespace(to=self._listen, to_all=self._listen)
         settings = LocalNodeSettings(
-            world="camera", robot_odometry="topic", robot_odometry_topic="wheels", image_topic="camera/image_raw"
+            world="camera", robot_odometry=robot_odometry, robot_odometry_topic="wheels", image_topic="camera/image_raw"
         )
         self.input = CameraInput(node, settings, self.published.append)
         self.input.listen(listening, status)
@@ -58,11 +57,17 @@ class Robot:
         message.k = np.array((focal, 0.0, 80.0, 0.0, focal, 60.0, 0.0, 0.0, 1.0))
         self._topics["/camera/camera_info"](message)
 
+    def mount(self, frame: str, parent: str, height_m: float) -> None:
+        each = TransformStamped(child_frame_id=frame)
+        each.header.frame_id, each.transform.translation.z, each.transform.rotation.w = parent, height_m, 1.0
+        self._topics["/tf_static"](TFMessage(transforms=[each]))
+
     def see(self, stamp_s: float, wheels_s: float | None = None) -> None:
         wheels, picture = Odometry(), Image(width=160, height=120, encoding="mono8", step=160, data=bytes(160 * 120))
         picture.header.stamp, picture.header.frame_id = to_time(round(stamp_s * 1e9)), "base_link"
         wheels.header.stamp = to_time(round((stamp_s if wheels_s is None else wheels_s) * 1e9))
-        self._topics["/wheels"](wheels)
+        if "/wheels" in self._topics:
+            self._topics["/wheels"](wheels)
         self._topics["/camera/image_raw"](picture)
 
 
@@ -95,3 +100,19 @@ def test_a_clock_that_is_wrong_is_a_problem_with_both_stamps() -> None:
         robot.input.problems()
     )
     assert not robot.input.problems()
+
+
+def test_without_odometry_the_height_over_the_floor_gives_the_scale_or_there_is_none() -> None:
+    robot = Robot("none")
+    robot.calibrate(100.0)
+    robot.see(1.0)
+    assert "no odometry of the robot, and the camera is 0 m over the robot's frame" in robot.dropped[-1]
+    for frame, parent, height_m in (("base_link", "base_footprint", 0.3), ("camera", "base_link", 0.2)):
+        robot.mount(frame, parent, height_m)
+    robot.calibrate(100.0, "camera")
+    robot.see(1.1)
+    robot.see(1.2)
+    assert [step is None for step in robot.published] == [False]
+    assert "1 pictures showed too little of the floor: they have the scale of those before them, or none" in (
+        robot.input.problems()
+    )

@@ -23,7 +23,7 @@ from ngo_recordings.scan_stream import WheelPose
 from ngo_recordings.topics import TopicArguments
 from tests.unit.ngo_estimator.rendered_room import by_wheels, camera, drive, picture, rays_of
 from tests.unit.ngo_recordings import messages as m
-from training.scoring.metrics import absolute_error_m
+from training.scoring.metrics import absolute_error_m, path_length_m
 
 BEGIN_NS, PERIOD_NS = 1_000_000_000_000, 100_000_000
 FRAME = "camera_optical_frame"
@@ -49,11 +49,14 @@ def odometry(stamp_ns: int, pose: np.ndarray) -> Any:
     return message
 
 
-def recording(path: Path, frames: int, model: CameraModel, info: Any | None, wheels: bool = True) -> np.ndarray:
+def recording(
+    path: Path, frames: int, model: CameraModel, info: Any | None, wheels: bool = True, mounted: bool = True
+) -> np.ndarray:
     """A drive round the room; returns the true poses ``(frames, 3)`` from the first on."""
     truth, rays, entries = drive(frames), rays_of(model), []
     counted = by_wheels(truth)
-    entries.append(("/tf_static", BEGIN_NS, mounting(model)))
+    if mounted:
+        entries.append(("/tf_static", BEGIN_NS, mounting(model)))
     if info is not None:
         entries.append(("/camera/camera_info", BEGIN_NS, info))
     for k, pose in enumerate(truth):
@@ -130,7 +133,7 @@ def test_a_clock_that_is_wrong_is_said_in_one_line() -> None:
     [
         (False, True, 160, "camera", "no CameraInfo is on /camera/camera_info"),
         (False, True, 160, None, "no CameraInfo with pictures"),
-        (True, False, 160, None, "no odometry of the robot was found"),
+        (True, False, 160, None, "no odometry of the robot, and the camera is 0 m over the robot's frame; expected"),
         (True, True, 80, None, "pictures are 80 x 60; expected a width of 160 or more"),
     ],
 )
@@ -138,7 +141,7 @@ def test_what_is_missing_is_said_in_one_line(
     tmp_path: Path, info: bool, wheels: bool, width: int, world: str | None, complaint: str
 ) -> None:
     model = camera(width)
-    recording(tmp_path / "drive.mcap", 2, model, camera_info(model) if info else None, wheels)
+    recording(tmp_path / "drive.mcap", 2, model, camera_info(model) if info else None, wheels, mounted=wheels)
     with pytest.raises(ValueError, match=complaint):
         run(Arguments((tmp_path / "drive.mcap",), tmp_path / "out", world=world), Console(quiet=True))
 
@@ -150,9 +153,12 @@ def test_a_camera_that_nobody_calibrated_is_refused(tmp_path: Path) -> None:
         run(Arguments((tmp_path / "drive.mcap",), tmp_path / "out"), Console(quiet=True))
 
 
-def test_pictures_alone_may_be_named_for_their_wheels(tmp_path: Path) -> None:
-    model = camera(160)
-    recording(tmp_path / "drive.mcap", 2, model, camera_info(model))
+def test_without_wheels_the_floor_gives_the_scale(tmp_path: Path) -> None:
+    model, console = camera(240), Console(record=True, width=200)
+    truth = recording(tmp_path / "drive.mcap", 20, model, camera_info(model))
     arguments = Arguments((tmp_path / "drive.mcap",), tmp_path / "out", topics=TopicArguments(wheels="none"))
-    with pytest.raises(ValueError, match="no odometry of the robot was found"):
-        run(arguments, Console(quiet=True))
+    result = run(arguments, console)
+    assert "the scale comes from the camera's height of 0.900 m over the floor" in console.export_text()
+    assert result["without_floor"] == result["by_odometry_alone"] == 0
+    found = read_tum(tmp_path / "out" / "corrected.tum").planar()
+    assert absolute_error_m(found, truth) < 0.05 * path_length_m(truth)

@@ -13,11 +13,10 @@ from rclpy.qos import QoSProfile, ReliabilityPolicy
 from scipy.spatial.transform import Rotation
 from sensor_msgs.msg import CameraInfo, CompressedImage, Image, PointCloud2
 
-from ngo_common.nodes.process import StartError
 from ngo_common.nodes.qos import overridable
 from ngo_estimator.data.relative_step import RelativeStep
 from ngo_estimator.frontend.camera.calibrated_camera import NOT_MOUNTED, calibrated_camera
-from ngo_estimator.frontend.camera.picture_odometry import PictureOdometry
+from ngo_estimator.frontend.camera.picture_odometry import SCALELESS, PictureOdometry
 from ngo_estimator.nodes import messages
 from ngo_estimator.nodes.listening import Listening
 from ngo_estimator.nodes.robot_odometry import RobotOdometry
@@ -25,6 +24,7 @@ from ngo_estimator.nodes.settings import LocalNodeSettings
 from ngo_estimator.nodes.status import NodeStatus
 from ngo_recordings.calibration import Calibration, calibration_of, info_topics
 from ngo_recordings.images import COMPRESSED_TYPE, IMAGE_TYPE, picture
+from ngo_recordings.mounting import FLOOR_FRAME
 from ngo_recordings.poses import Pose
 
 _MOUNTING_WAIT_NS = 2_000_000_000
@@ -42,14 +42,10 @@ class CameraInput:
     """
 
     def __init__(self, node: Node, settings: LocalNodeSettings, publish: Callable[[RelativeStep | None], None]) -> None:
-        if settings.robot_odometry == "none":
-            raise StartError(
-                "parameter 'robot_odometry' is 'none'; expected 'topic' or 'tf': world:=camera takes the scale of the "
-                "motion from the robot's odometry"
-            )
         cv2.setNumThreads(settings.threads)
         self._node, self._settings, self._publish = node, settings, publish
         self._robot = RobotOdometry(node, settings, self._add_wheels, self._on_transforms, self._update)
+        self._by_floor = settings.robot_odometry == "none"
         self._is_compressed = settings.image_transport == "compressed"
         self._topic = settings.image_topic + ("/compressed" if self._is_compressed else "")
         self._calibration: Calibration | None = None
@@ -60,12 +56,13 @@ class CameraInput:
         self._held: deque[tuple[int, np.ndarray]] = deque(maxlen=_MOST_HELD)
         self._given: deque[tuple[int, np.ndarray]] = deque(maxlen=_MOST_GIVEN)  # odometry before there is a core
         self._restarts = self._newly_alone = self._unplaced = self._jumps = 0
-        self._newly_unplaced = self._newly_jumped = 0
+        self._newly_unplaced = self._newly_jumped = self._newly_floorless = 0
 
     @property
     def description(self) -> str:
         """What the input listens to, in words."""
-        return f"pictures on '{self._node.resolve_topic_name(self._topic)}', {self._robot.description}"
+        scale = ": scale from the camera's height over the floor" if self._by_floor else ""
+        return f"pictures on '{self._node.resolve_topic_name(self._topic)}', {self._robot.description}{scale}"
 
     @property
     def _info_topics(self) -> tuple[str, ...]:
@@ -142,13 +139,14 @@ class CameraInput:
                 self._restarts = self._core.restarts
                 self._publish(None)
                 self._node.get_logger().info("the pictures' stamps jumped back: the odometry starts anew")
-        alone = self._core.by_wheels
+        alone, floorless = self._core.by_wheels, self._core.floorless
         for step in self._core.ready():
             self._publish(step)
             if self._points.get_subscription_count():
                 frame = self._settings.framed(self._settings.base_frame)
                 self._points.publish(messages.points_message(step.stamp_ns, self._core.points, frame))
         self._newly_alone += self._core.by_wheels - alone
+        self._newly_floorless += self._core.floorless - floorless
         if unplaced := self._core.unplaced - self._unplaced:
             self._status.dropped("picture", f"no odometry at its stamp ({self._core.clocks})", unplaced)
             self._newly_unplaced += unplaced
@@ -171,7 +169,7 @@ class CameraInput:
             )
         try:
             model = calibrated_camera(replace(self._calibration, frame_id=frame), mounting)
-            self._core = PictureOdometry(model)
+            self._core = PictureOdometry(model, by_floor=self._by_floor)
         except ValueError as error:
             self._calibration = self._said = None
             self._held.clear()
@@ -194,7 +192,11 @@ class CameraInput:
     def _mounting(self) -> Pose | None:
         if self._frame == self._robot.base_frame:
             return Pose(np.zeros(3), Rotation.identity())
-        return self._robot.transforms.newest_lookup(self._robot.base_frame, self._frame) if self._frame else None
+        lookup = self._robot.transforms.newest_lookup
+        found = lookup(self._robot.base_frame, self._frame) if self._frame else None
+        if not self._by_floor or found is None:
+            return found
+        return lookup(self._settings.framed(FLOOR_FRAME), self._frame) or found
 
     def reset(self) -> str:
         """Start anew with the next picture; returns what that means, in words."""
@@ -218,9 +220,12 @@ class CameraInput:
     def problems(self) -> list[str]:
         """A line for each thing that was wrong since the last call."""
         found = []
-        if self._newly_alone:
-            found.append(f"{self._newly_alone} pictures told too little: the robot's odometry alone counts there")
+        if self._core is not None and self._newly_alone:
+            found.append(f"{self._newly_alone} pictures told too little: {self._core.instead}")
             self._newly_alone = 0
+        if self._newly_floorless:
+            found.append(f"{self._newly_floorless} pictures showed too little of the floor: {SCALELESS}")
+            self._newly_floorless = 0
         if self._newly_jumped:
             found.append(f"the robot's odometry jumped {self._newly_jumped} times: the motion is guessed there")
             self._newly_jumped = 0
@@ -229,7 +234,7 @@ class CameraInput:
         self._newly_unplaced = 0
         if self._calibration is None and self._held:
             found.append(f"no CameraInfo came on {' or '.join(self._info_topics)}, without which pictures are not used")
-        if not self._given and (self._core is None or not self._core.has_wheels):
+        if not self._by_floor and not self._given and (self._core is None or not self._core.has_wheels):
             found.append("no odometry of the robot came yet")
         if self._core is not None and not self._mounted:
             found.append(f"no transform says where the camera sits on '{self._robot.base_frame}'")

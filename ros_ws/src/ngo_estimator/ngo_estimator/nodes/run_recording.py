@@ -333,7 +333,7 @@ def _camera(arguments: Arguments, recording: Recording, console: Console) -> "St
     from ngo_estimator.slam.picture_trajectory import PictureTrajectory
     from ngo_recordings.calibration import calibration_of, info_topics
     from ngo_recordings.frames import frames as frames_of
-    from ngo_recordings.mounting import find_pose
+    from ngo_recordings.mounting import FLOOR_FRAME, find_pose
     from ngo_recordings.scan_stream import wheel_poses
 
     cv2.setNumThreads(1)
@@ -344,13 +344,9 @@ def _camera(arguments: Arguments, recording: Recording, console: Console) -> "St
         raise ValueError(
             f"no CameraInfo is on {' or '.join(named)}: {CAMERA_WORLD} needs the calibration of {topics.image}"
         )
-    if topics.wheels is None:
-        raise ValueError(
-            f"no odometry of the robot was found: {CAMERA_WORLD} takes the scale of the motion from it; name "
-            "it (--wheels)"
-        )
     seen = calibration_of(recording.first(info).value, info, topics.image)
-    mounted = find_pose(recording, topics, seen.frame_id or None)
+    by_floor = topics.wheels is None
+    mounted = find_pose(recording, topics, seen.frame_id or None, *([FLOOR_FRAME] if by_floor else []))
     if mounted is None:
         pose, where = None, f"no transform says where it sits: {NOT_MOUNTED}"
     else:
@@ -358,12 +354,17 @@ def _camera(arguments: Arguments, recording: Recording, console: Console) -> "St
         seen = replace(seen, frame_id=frame)
         where = f"{frame} in {base} at {', '.join(f'{value:.3f}' for value in pose.position)} m (from {source})"
     model = calibrated_camera(seen, pose)
-    odometry = PictureOdometry(model)
+    odometry = PictureOdometry(model, by_floor=by_floor)
     used = f"using {_words(topics)}, calibration {info}"
     console.print("; ".join((used, *recording.notes)))
     console.print(f"camera: {seen.width} x {seen.height}, {model.description}; {where}")
+    if by_floor:
+        console.print(
+            f"no odometry of the robot was found (name it: --wheels): the scale comes from the camera's height of "
+            f"{model.centre[2]:.3f} m over the floor, where the floor is seen"
+        )
     core = CameraRun(odometry, PictureTrajectory(iterations_per_step=arguments.iterations_per_step))
-    wheels = wheel_poses(recording, topics, core.rejected)
+    wheels = () if by_floor else wheel_poses(recording, topics, core.rejected)
     frames = frames_of(recording, topics, core.rejected, (seen.height, seen.width))
     return CAMERA_WORLD, topics, core, core.run(frames, wheels)
 

@@ -133,8 +133,9 @@ class LocalNodeSettings(EstimatorSettings):
     )
     robot_odometry: str = setting(
         "none",
-        "Odometry that the robot has of its own, with world:=scan, or camera, which needs it: none, an Odometry on "
-        "robot_odometry_topic, or any chain from odom_frame to base_frame on tf_topic, which then stays the robot's.",
+        "Odometry that the robot has of its own, with world:=scan or camera: none (a camera then takes the scale from "
+        "its height over the floor), an Odometry on robot_odometry_topic, or any chain from odom_frame to base_frame "
+        "on tf_topic, which then stays the robot's.",
         choices=("none", "topic", "tf"),
     )
     robot_odometry_topic: str = topic("wheel_odom", "Odometry of the robot, with robot_odometry:=topic.")

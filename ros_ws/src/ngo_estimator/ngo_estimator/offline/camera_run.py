@@ -4,7 +4,7 @@ from collections.abc import Iterable, Iterator
 from typing import Any
 
 from ngo_estimator.data.relative_step import RESTART_AFTER_NS
-from ngo_estimator.frontend.camera.picture_odometry import PictureOdometry
+from ngo_estimator.frontend.camera.picture_odometry import SCALELESS, PictureOdometry
 from ngo_estimator.offline.recorded import RecordedRun, RecordedStep, Run, Truth
 from ngo_estimator.slam.picture_trajectory import PictureTrajectory
 from ngo_estimator.trajectory.files import seconds
@@ -26,20 +26,20 @@ class CameraRun(Run):
     def __init__(self, odometry: PictureOdometry, online: PictureTrajectory) -> None:
         super().__init__(online, "picture")
         self._odometry = odometry
-        self._steps = self._by_wheels = 0
+        self._steps = self._by_wheels = self._floorless = 0
 
     @property
     def facts(self) -> dict[str, Any]:
         """What else is worth keeping of the run."""
-        return {"by_odometry_alone": self._by_wheels, **super().facts}
+        return {"by_odometry_alone": self._by_wheels, "without_floor": self._floorless, **super().facts}
 
     def remarks(self) -> list[str]:
         """What a person should know of the run, a line each."""
         lines = []
         if self._by_wheels:
-            lines.append(
-                f"{self._by_wheels} of {self._steps} pictures told too little: the robot's odometry alone counts there"
-            )
+            lines.append(f"{self._by_wheels} of {self._steps} pictures told too little: {self._odometry.instead}")
+        if self._floorless:
+            lines.append(f"{self._floorless} of {self._steps} pictures showed too little of the floor: {SCALELESS}")
         if self._odometry.jumps:
             lines.append(f"the robot's odometry jumped {self._odometry.jumps} times: the motion is guessed there")
         return lines + super().remarks()
@@ -94,6 +94,7 @@ class CameraRun(Run):
     def _finished(self, truth: Truth) -> Iterator[RecordedRun]:
         self._steps += self._odometry.frames
         self._by_wheels += self._odometry.by_wheels
+        self._floorless += self._odometry.floorless
         yield from super()._finished(truth)
 
 
@@ -102,7 +103,7 @@ def _pieces(wheels: Iterable[WheelPose]) -> list[list[WheelPose]]:
     recorded = list(wheels)
     pieces: list[list[WheelPose]] = [[]]
     newest_ns = 0
-    for pose, following in zip(recorded, [*recorded[1:], None], strict=True):
+    for pose, following in zip(recorded, [*recorded, None][1:], strict=True):
         both_ns = max(pose.stamp_ns, pose.stamp_ns if following is None else following.stamp_ns)
         if pieces[-1] and both_ns <= newest_ns - RESTART_AFTER_NS:
             pieces.append([])

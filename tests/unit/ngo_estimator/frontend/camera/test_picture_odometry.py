@@ -1,6 +1,7 @@
 """Odometry of pictures where they, or the wheels, tell nothing."""
 
 import math
+from dataclasses import replace
 
 import cv2
 import numpy as np
@@ -10,6 +11,7 @@ from ngo_estimator.data.relative_step import RelativeStep
 from ngo_estimator.frontend.camera.feature_tracks import corners, followed, repeated
 from ngo_estimator.frontend.camera.picture_odometry import PictureOdometry
 from ngo_estimator.frontend.camera.tracked_odometry import _likelier
+from ngo_estimator.geometry.camera_model import tilted
 from ngo_estimator.geometry.planar_motion import between
 from ngo_estimator.geometry.view_pose import ViewPose
 from tests.unit.ngo_estimator.rendered_room import PLAIN, TILES, by_wheels, camera, drive, picture, rays_of
@@ -134,3 +136,20 @@ def test_a_picture_is_no_surer_than_the_wheels_where_walls_repeat() -> None:
 
 def test_a_wide_picture_is_surer_than_the_wheels_where_nothing_repeats() -> None:
     assert (heading_stds(PLAIN, 640, 1) < 0.3 * heading_stds(np.zeros_like(PLAIN), 640, 1)).all()
+
+
+def test_the_floor_tells_the_scale_and_where_it_is_not_seen_nobody_is_sure_of_the_way() -> None:
+    model, truth = camera(320), drive(16)
+    up = model.base_from_camera.copy()
+    up[:, :3] = tilted(-0.6, 0.9)[:, :3]
+    for mounted, floor in ((model.base_from_camera, True), (up, False)):
+        seeing = replace(model, base_from_camera=mounted)
+        rays, steps, odometry = rays_of(seeing), list[RelativeStep](), PictureOdometry(seeing, by_floor=True)
+        for k, pose in enumerate(truth):
+            odometry.add_picture(k * PERIOD_NS, picture(seeing, rays, pose))
+            steps += odometry.ready()
+        assert odometry.floorless == (0 if floor else 15)
+        off_m = np.linalg.norm(steps[-1].odom_xyyaw[:2] - between(truth[0], truth[-1])[:2])
+        std_m = math.sqrt(sum(step.covariance[0, 0] for step in steps))
+        assert off_m < 3.0 * std_m
+        assert off_m < 0.05 and std_m < 0.1 if floor else std_m > 0.2

@@ -24,6 +24,10 @@ class CameraConfig:
     given_rad: float = 0.01
     # Turn that the given motion may miss, rad for each m.
     given_rad_per_m: float = 0.05
+    # Without wheels: the least share of corners below the horizon that move as the floor does, and the camera's least
+    # height over it (m).
+    floor_share: float = 0.4
+    least_height_m: float = 0.05
     # Silence of the odometry (s) beyond which its straight line through the gap counts as a guess.
     silent_s: float = 0.25
     # Deviations of speed (m/s, rad/s) and acceleration (m/s^2, rad/s^2) where nobody knows them.

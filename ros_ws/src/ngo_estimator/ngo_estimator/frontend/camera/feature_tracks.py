@@ -15,6 +15,9 @@ _BACK_PX = 1.0
 _ALIKE = 4.0
 """Residual of another place, by that of the right one, below which they look alike."""
 
+_TILES_ACROSS, _IN_TILE = 8, 5
+"""Tiles in a row of a picture, and corners in each that are spread."""
+
 
 def followed(before: Grey, now: Grey, pixels: Array, guess: Array) -> tuple[Array, np.ndarray, Array]:
     """Where corners ``(n, 2)`` of one picture are in the next, which were found ``(n,)``, and the residual of the
@@ -70,3 +73,16 @@ def corners(grey: Grey, most: int, apart_px: float, taken: Array) -> Array:
         cv2.circle(free, (x, y), int(apart_px), 0, -1)
     found = cv2.goodFeaturesToTrack(grey, most, 0.003, apart_px, mask=free)  # Shi and Tomasi 1994
     return np.zeros((0, 2)) if found is None else found.reshape(-1, 2).astype(np.float64)
+
+
+def spread_corners(grey: Grey, top: int, apart_px: float, taken: Array) -> Array:
+    """New corners ``(n, 2)`` below the row ``top``, a few in each tile: a floor has weaker ones than walls have."""
+    height, width = grey.shape
+    tile, at = width // _TILES_ACROSS, taken
+    for y in range(top, height - tile // 2, tile):
+        for x in range(0, width - tile // 2, tile):
+            near = at - (x, y)
+            near = near[((near > -apart_px) & (near < tile + apart_px)).all(1)]
+            part = np.ascontiguousarray(grey[y : y + tile, x : x + tile])
+            at = np.concatenate((at, corners(part, _IN_TILE - len(near), apart_px, near) + (x, y)))
+    return at[len(taken) :]

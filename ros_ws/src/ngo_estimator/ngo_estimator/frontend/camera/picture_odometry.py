@@ -21,6 +21,9 @@ from ngo_estimator.geometry.planar_motion import between
 LEAST_WIDTH = 160
 """Pixels that a picture needs across: in smaller ones too few features are found again."""
 
+SCALELESS = "they have the scale of those before them, or none"
+"""Of pictures without the floor, where it tells the scale."""
+
 _MOST_WAITING = 64
 _NOTHING = np.zeros(0, np.float32)
 
@@ -38,15 +41,29 @@ class PictureOdometry:
     """Takes pictures and poses of the robot's odometry by their stamps, and hands on a step for each picture.
 
     A picture waits for the odometry at its stamp. The first one is the origin.
+
+    Args:
+        by_floor: there is no odometry of the robot, and no picture waits for it: the scale comes from the camera's
+            height over the floor.
     """
 
     def __init__(
-        self, model: CameraModel, config: CameraConfig | None = None, describer: Describer | None = None
+        self,
+        model: CameraModel,
+        config: CameraConfig | None = None,
+        describer: Describer | None = None,
+        by_floor: bool = False,
     ) -> None:
         require_usable(model)
-        self.model, self._config = model, config or CameraConfig()
+        self.model, self._config, self._by_floor = model, config or CameraConfig(), by_floor
+        if by_floor and not model.centre[2] >= self._config.least_height_m:
+            raise ValueError(
+                f"there is no odometry of the robot, and the camera is {model.centre[2]:g} m over the robot's frame; "
+                f"expected the one, or {self._config.least_height_m:g} m or more by its transform: the scale comes "
+                "from either"
+            )
         self._describer = describer or Sift(self._config.features)
-        self._odometry = TrackedOdometry(model, self._config)
+        self._odometry = TrackedOdometry(model, self._config, by_floor)
         self.restarts = 0
         """How often stamps jumped back, so that the odometry began anew."""
         self.unplaced = self.jumps = 0
@@ -63,12 +80,15 @@ class PictureOdometry:
         self._origin_ns = 0
         self._given = np.zeros(3)  # the wheels' pose at the last picture
         self._velocity = np.zeros(3)  # the last one that was given and believed, in base axes
+        self._blind_s = 0.0  # since a picture told a way, where there are no wheels
         self._key_pose = np.zeros(3)
         self._origin_code: np.ndarray | None = None
         self.has_wheels = False
         """Whether odometry of the robot came."""
         self.frames = self.by_wheels = 0
         """Frames with a step, and those whose picture told too little: the robot's odometry alone counts there."""
+        self.floorless = 0
+        """Frames without enough of the floor, where it gives the scale: only ranges remember it there."""
 
     def add_wheels(self, stamp_ns: int, pose_xyyaw: np.ndarray) -> None:
         """Take a pose ``(3,)`` of the robot's odometry, in its own frame."""
@@ -109,6 +129,11 @@ class PictureOdometry:
         self._waiting.append((stamp_ns, _grey(picture)))
 
     @property
+    def instead(self) -> str:
+        """What counts where a picture tells too little, in words."""
+        return "the way is a guess there" if self._by_floor else "the robot's odometry alone counts there"
+
+    @property
     def inliers(self) -> int:
         """Corners that agreed with the newest pose."""
         return self._odometry.inliers
@@ -127,10 +152,11 @@ class PictureOdometry:
         """The steps of pictures whose odometry is known; at the end, of all that lie within it."""
         while self._waiting:
             stamp_ns, grey = self._waiting[0]
-            if not at_end and (not self.has_wheels or self._wheels.newest_ns < stamp_ns):
+            waits = not self.has_wheels or self._wheels.newest_ns < stamp_ns
+            if waits and not at_end and not self._by_floor:
                 return
             self._waiting.popleft()
-            given = self._wheels.pose_at(stamp_ns * 1e-9)
+            given = self._given if self._by_floor else self._wheels.pose_at(stamp_ns * 1e-9)
             if given is None:
                 self.unplaced += 1
             elif (step := self._step(stamp_ns, grey, given)) is not None:
@@ -153,26 +179,35 @@ class PictureOdometry:
             return None
         self.frames += 1
         self.by_wheels += odometry.inliers < self._config.least_inliers
+        if self._by_floor:
+            self.floorless += not odometry.floor_seen
+            took_s, blind = (stamp_ns - last_ns) * 1e-9, not odometry.scaled
+            self._velocity = np.zeros(3) if blind else relative / took_s
+            self._blind_s = self._blind_s + took_s if blind else 0.0
         moved = between(self._key_pose, odometry.pose)
         is_key = math.hypot(moved[0], moved[1]) > self._config.key_m or abs(moved[2]) > self._config.key_rad
         origin, self._origin_code = self._origin_code, None
         return RelativeStep(
             stamp_ns, last_ns, relative, covariance, self._origin_ns, odometry.pose.copy(), _NOTHING,
-            self._key_code(grey) if is_key else _NOTHING, from_place_code=origin, robot_odom_xyyaw=given.copy(),
+            self._key_code(grey) if is_key else _NOTHING, from_place_code=origin,
+            robot_odom_xyyaw=None if self._by_floor else given.copy(),
         )  # fmt: skip
 
     def _motion(self, last_ns: int | None, stamp_ns: int, given: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """The motion ``(3,)`` to a picture by the wheels, whose pose is ``given`` there, and variances ``(3,)`` of what
-        they leave open of it (m, m, rad): the way in a gap between readings, and all of it where their frame jumped."""
+        they leave open of it (m, m, rad): the way in a gap between readings, and all of it where their frame jumped, or
+        there are none. Then the velocity goes on."""
         motion, config = between(self._given, given), self._config
         if last_ns is None:
             return motion, np.zeros(3)
         took_s = (stamp_ns - last_ns) * 1e-9
         speeds = np.array((math.hypot(motion[0], motion[1]), abs(motion[2]))) / max(took_s, config.least_s)
         speed, acceleration = np.array(config.unknown_speed), np.array(config.unknown_acceleration)
-        if (speeds > config.fastest).any():
-            self.jumps += 1
-            return self._velocity * took_s, (speed * took_s)[[0, 0, 1]] ** 2
+        jumped = bool((speeds > config.fastest).any())
+        self.jumps += jumped
+        if jumped or self._by_floor:
+            open_s2 = (self._blind_s + took_s) ** 2 - self._blind_s**2  # a wrong velocity adds up
+            return self._velocity * took_s, (speed**2 * open_s2)[[0, 0, 1]]
         self._velocity = motion / took_s
         # Between two readings the way strays from the line between them by so much, and by no more than the robot goes;
         # from one reading to the other it does not (a Brownian bridge).

@@ -1,9 +1,9 @@
-"""Odometry of a calibrated camera on a robot whose motion is given roughly, as by wheels: no training.
+"""Odometry of a calibrated camera on a robot whose motion is given roughly, by wheels or by the floor: no training.
 
 Corners are followed from picture to picture. Each has a range, which grows sure while the robot moves. A picture's pose
 is fitted to all of them at once, with the given motion as a prior (``geometry/view_pose.py``): heading and direction of
 motion come from the picture, and the scale from the given motion, which ranges remember. Where pictures tell nothing,
-the given motion counts alone.
+the given motion counts alone. Without wheels corners on the floor give it (``geometry/floor_way.py``).
 """
 
 import math
@@ -12,9 +12,10 @@ from dataclasses import replace
 import numpy as np
 
 from ngo_estimator.frontend.camera.camera_config import CameraConfig
-from ngo_estimator.frontend.camera.feature_tracks import Grey, corners, followed, repeated
+from ngo_estimator.frontend.camera.feature_tracks import Grey, corners, followed, repeated, spread_corners
 from ngo_estimator.geometry import se2
 from ngo_estimator.geometry.camera_model import CameraModel
+from ngo_estimator.geometry.floor_way import BELOW, floor_way
 from ngo_estimator.geometry.planar_motion import between, compose, turned_covariance, wrap
 from ngo_estimator.geometry.planar_views import ransac
 from ngo_estimator.geometry.view_pose import (
@@ -54,10 +55,17 @@ _VARIANCES = np.array((1e-8, 1e-8, 1e-9))
 
 
 class TrackedOdometry:
-    """Poses of frames from pictures and the given motion between them."""
+    """Poses of frames from pictures and the given motion between them.
 
-    def __init__(self, model: CameraModel, config: CameraConfig) -> None:
-        self._model, self._config = model, config
+    Args:
+        by_floor: the motion that is given is a guess; corners on the floor tell a better one.
+    """
+
+    def __init__(self, model: CameraModel, config: CameraConfig, by_floor: bool = False) -> None:
+        self._model, self._config, self._by_floor = model, config, by_floor
+        rows = np.arange(model.height, dtype=np.float64)
+        ahead = model.rays(np.column_stack((np.full(model.height, 0.5 * model.width), rows)))
+        self._horizon_row = int((ahead[:, 2] > -BELOW).sum())
         self.reset()
 
     def reset(self) -> None:
@@ -66,6 +74,8 @@ class TrackedOdometry:
         """Of the newest frame ``(3,)``, in ``odom``."""
         self.inliers = 0
         """Corners that agreed with the newest pose."""
+        self.floor_seen = self.scaled = False
+        """Whether the newest picture showed enough of the floor, and whether that or ranges gave its motion a scale."""
         self._centre_now = self._model.centre.copy()  # of the camera, as the floor rises
         self._grey: Grey | None = None
         self._pixels = np.zeros((0, 2))
@@ -105,13 +115,17 @@ class TrackedOdometry:
             self._begin_step()
             return np.zeros(3), np.diag(_VARIANCES)
         before = self.pose
-        self._given = compose(self._given, given)
+        self._given = compose(between(self._from, before) if self._by_floor else self._given, given)
         self._way += math.hypot(given[0], given[1])
         self._turn += abs(given[2])
         self._frames += 1
         self._unknown = self._unknown + unknown
         self._follow(grey, compose(before, given))
+        if self._by_floor:  # the guess goes on from the pose before it, which is as unsure as it is
+            self._unknown = np.diag(self._covariance) + unknown
         fitted = self._fit(compose(before, given))
+        if self._by_floor:
+            fitted = self._scaled_by_floor(fitted)
         self._take(fitted)
         relative = between(before, self.pose)
         covariance = self._step_covariance(relative, turned_covariance(-self._from[2], fitted.covariance))
@@ -136,6 +150,34 @@ class TrackedOdometry:
         elsewhere = self._pixels + either_way * np.where(near[:, None], turned - guess, 0.0)
         self._sure = ~repeated(self._grey, grey, self._pixels, at, elsewhere, residual)[found & near]
         self._keep(found & near, at)
+
+    def _scaled_by_floor(self, fitted: ViewPose) -> ViewPose:
+        """The pose with the way that the floor tells, else with that of ranges, else as unsure as the guess."""
+        if self._measure_way(fitted.pose):
+            fitted = self._fit(fitted.pose)
+        ranged = (fitted.inlier & self._points.known).sum() >= self._config.least_inliers
+        self.scaled = self.floor_seen or (self.scaled and bool(ranged))
+        wide = _not_surer(fitted.covariance, self._prior[1])
+        return fitted if self.scaled else replace(fitted, covariance=wide)
+
+    def _measure_way(self, pose: Array) -> bool:
+        """Whether the floor tells how far the newest picture is from the last step, in the direction of a ``pose``
+        ``(3,)``; then that motion is given. While few ranges are known the direction is that of two views alone."""
+        config, seen, moved = self._config, self._model.rays(self._pixels), between(self._from, pose)
+        way, yaw = self._camera_way(moved), moved[2]
+        if self._points.known.sum() < config.least_inliers:
+            found = ransac(self._from_rays, seen, _RANSAC_PX * self._model.pixel_rad, _RANSAC_SAMPLES)
+            if found is not None:
+                yaw, direction = found[0]
+                way = np.array((math.cos(direction), math.sin(direction)))
+        axis = way / max(float(np.linalg.norm(way)), 1e-9)
+        std_rad = self._deviations(seen, pose, config.range_pixel_std)
+        length = floor_way(self._from_rays, seen, std_rad, self._model.centre[2], yaw, axis, config.least_inliers,
+                           config.floor_share)  # fmt: skip
+        self.floor_seen = length is not None
+        if length is not None:
+            self._given, self._unknown = self._moved(length * axis, yaw), np.zeros(3)
+        return self.floor_seen
 
     def _turn_variance(self, way: float, turn: float, frames: float) -> float:
         """Of the given heading, after a way (m) and a turn (rad) in so many frames."""
@@ -166,7 +208,7 @@ class TrackedOdometry:
         if len(self._points) < self._config.least_inliers:
             return alone
         seen = self._model.rays(self._pixels)
-        std_rad = self._deviations(seen, predicted)
+        std_rad = self._deviations(seen, predicted, self._config.pixel_std)
         information = np.linalg.inv(covariance)
 
         def fit(start: Array, held: Array) -> ViewPose:
@@ -196,12 +238,10 @@ class TrackedOdometry:
         sure = (fitted.inlier & self._sure).sum() >= _SURE_SHARE * fitted.inlier.sum()
         return fitted if sure else replace(fitted, covariance=covariance)
 
-    def _deviations(self, seen: Array, predicted: Array) -> Array:
+    def _deviations(self, seen: Array, predicted: Array, pixel_std: float) -> Array:
         """Of rays ``(n,)``, rad: corners that moved far against what is far away are followed worse."""
         parallax = np.linalg.norm(seen - self._from_rays @ _turn(predicted[2] - self._from[2]), axis=1)
-        deviations: Array = np.hypot(
-            self._config.pixel_std * self._model.pixel_rad, self._config.parallax_std * parallax
-        )
+        deviations: Array = np.hypot(pixel_std * self._model.pixel_rad, self._config.parallax_std * parallax)
         return deviations
 
     def _without_prior(self, seen: Array, mean: Array) -> Array | None:
@@ -209,13 +249,20 @@ class TrackedOdometry:
         found = ransac(self._from_rays, seen, _RANSAC_PX * self._model.pixel_rad, _RANSAC_SAMPLES)
         if found is None:
             return None
-        (yaw, direction), _ = found
-        way = between(self._from, mean)
-        moved = camera_at(way, self._model.centre)[:2] - self._model.centre[:2]
+        yaw, direction = found[0]
+        moved = self._camera_way(between(self._from, mean))
         axis = np.array((math.cos(direction), math.sin(direction)))
         at = axis * np.linalg.norm(moved) * (1.0 if axis @ moved >= 0.0 else -1.0)
-        at -= se2.rotate(np.asarray(yaw), self._model.centre[:2]) - self._model.centre[:2]
-        return compose(self._from, np.array((at[0], at[1], yaw)))
+        return compose(self._from, self._moved(at, yaw))
+
+    def _camera_way(self, motion: Array) -> Array:
+        """The way of the camera ``(2,)`` when the robot moves ``(3,)``."""
+        way: Array = (camera_at(motion, self._model.centre) - self._model.centre)[:2]
+        return way
+
+    def _moved(self, way: Array, yaw: float) -> Array:
+        """The motion ``(3,)`` of a robot that turns, whose camera goes a way ``(2,)``."""
+        return np.append(way - self._camera_way(np.array((0.0, 0.0, yaw))), yaw)
 
     def _take(self, fitted: ViewPose) -> None:
         self.pose, self.inliers = fitted.pose, int(fitted.inlier.sum())
@@ -264,7 +311,11 @@ class TrackedOdometry:
     def _look_for_corners(self, grey: Grey) -> None:
         config = self._config
         apart_px = config.apart * self._model.width
-        fresh = corners(grey, config.corners - len(self._pixels), apart_px, self._pixels)
+        fresh = np.zeros((0, 2))
+        if self._by_floor:
+            fresh = spread_corners(grey, self._horizon_row, apart_px, self._pixels)
+        taken = np.concatenate((self._pixels, fresh))
+        fresh = np.concatenate((fresh, corners(grey, config.corners - len(taken), apart_px, taken)))
         rays = self._model.rays(fresh) @ _turn(self.pose[2]).T
         known = self._points.inverse[self._points.inverse_std < 0.2 * self._points.inverse]
         inverse = float(np.clip(np.median(known), 0.05, 2.0)) if len(known) > 10 else INVERSE
