@@ -101,6 +101,16 @@ def test_robots_that_meet_are_in_one_map_frame_and_on_one_map_until_a_reset(tmp_
             assert poses["blue"][0].header.frame_id == "blue/map" and poses["blue"][-1].header.frame_id == "map"
             expected_frames = {("map", "red/odom"), ("blue/map", "blue/odom"), ("map", "blue/odom")}
             probe.spin_until(lambda: set(map(frames, transforms)) == expected_frames, "the transforms of both")
+            # A burst behind a silence, of which three steps were lost, costs nothing but the time.
+            burst = robots()["blue"][k + 4 : k + 10]
+            for step in burst:
+                steps["blue"].publish(relative_pose_message(step, "base_link"))
+                expected = core.update("blue", step)
+                core.correct()
+            probe.spin_until(lambda: len(poses["blue"]) == k + 1 + len(burst), "the poses of a burst")
+            assert poses["blue"][-1].header.frame_id == "map"
+            at = poses["blue"][-1].pose.pose.position
+            np.testing.assert_allclose((at.x, at.y), expected.update.pose_xyyaw[:2], atol=1e-2)
             # What blue saw before is on the map as well.
             diagnostics.wait_for_value("/ngo_map", "scans that wait for their poses", lambda value: value == "0")
             assert maps[-1].header.frame_id == "map"
