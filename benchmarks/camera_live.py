@@ -42,16 +42,11 @@ _INPUTS = {"image": Image, "camera_info": CameraInfo, "wheel_odom": Odometry}
 class Arguments:
     """What to drive."""
 
-    wad: str = "freedoom1.wad"
-    """File of the map."""
-    map: str = "E1M1"
-    """Map to drive on."""
-    seed: int = 10_000
-    """Of the drive and its wheels."""
-    pictures: int = 2000
-    """Pictures at 15 a second."""
-    before: int = 100
-    """Pictures before, as fast as they are answered."""
+    wad: str = "freedoom1.wad"  # File of the map.
+    map: str = "E1M1"  # Map to drive on.
+    seed: int = 10_000  # Of the drive and its wheels.
+    pictures: int = 2000  # Pictures at 15 a second.
+    before: int = 100  # Pictures before, as fast as they are answered.
 
     def __post_init__(self) -> None:
         if self.pictures < 20 or self.before < 3:

@@ -35,12 +35,9 @@ LONGEST_S = 1.0
 class Arguments:
     """What to drive."""
 
-    seed: int = 12_000
-    """Building to drive through."""
-    robots: int = 4
-    """Robots in it."""
-    scans: int = 1500
-    """Scans of each."""
+    seed: int = 12_000  # Building to drive through.
+    robots: int = 4  # Robots in it.
+    scans: int = 1500  # Scans of each.
 
     def __post_init__(self) -> None:
         if self.robots < 2 or self.scans < 100:

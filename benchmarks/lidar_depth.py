@@ -64,10 +64,8 @@ WHEELS = WheelsConfig(left_bias=0.02, slips_per_km=60.0)
 class Arguments:
     """What is driven."""
 
-    seeds: tuple[int, ...] = (30_000, 30_001, 30_002, 30_003, 30_004)
-    """Buildings."""
-    scans: int = 200
-    """Scans of each drive."""
+    seeds: tuple[int, ...] = (30_000, 30_001, 30_002, 30_003, 30_004)  # Buildings.
+    scans: int = 200  # Scans of each drive.
 
 
 def main(arguments: Arguments) -> int:

@@ -36,10 +36,8 @@ class Arguments:
 
     seeds: tuple[int, ...] = (10_000, 10_001, 10_002, 10_003, 10_004)
     """Buildings, each with the scanner and the wheels that are drawn for it."""
-    scans: int = 600
-    """Scans of each drive."""
-    slips_per_km: float = 300.0
-    """How often the wheels slip."""
+    scans: int = 600  # Scans of each drive.
+    slips_per_km: float = 300.0  # How often the wheels slip.
 
 
 def main(arguments: Arguments) -> int:

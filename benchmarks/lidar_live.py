@@ -44,14 +44,10 @@ _FAR_M = 100_000.0
 class Arguments:
     """What to drive."""
 
-    seed: int = 10_000
-    """Building to drive through."""
-    scans: int = 2400
-    """Scans at 40 Hz."""
-    before: int = 200
-    """Scans before, as fast as they are answered."""
-    rays: int = 1080
-    """Rays of a scan, over 270 degrees."""
+    seed: int = 10_000  # Building to drive through.
+    scans: int = 2400  # Scans at 40 Hz.
+    before: int = 200  # Scans before, as fast as they are answered.
+    rays: int = 1080  # Rays of a scan, over 270 degrees.
 
     def __post_init__(self) -> None:
         if self.scans < 100 or self.before < 1:

@@ -55,10 +55,8 @@ _LASER = np.array((0.05, 0.05, 0.3))
 class Arguments:
     """What is driven."""
 
-    seed: int = 12
-    """Building."""
-    scans: int = 300
-    """Scans at 10 Hz."""
+    seed: int = 12  # Building.
+    scans: int = 300  # Scans at 10 Hz.
 
 
 def main(arguments: Arguments) -> int:

@@ -56,24 +56,16 @@ _FAR_M = 100_000.0
 class Arguments:
     """What to drive."""
 
-    world: Literal["maze2d", "maze3d", "scan"] = "maze2d"
-    """World to drive in."""
-    seed: int = 2000
-    """Maze or building to drive through."""
-    frames: int = 100_000
-    """Frames of the drive, a multiple of ``every``."""
-    every: int = 1000
-    """Frames that are summed up in one point of the curves."""
-    window: int = 2000
-    """Frames that are optimised together; a lidar has no window."""
-    key_frames: int = 128
-    """Key frames from before the window; a lidar has no window."""
+    world: Literal["maze2d", "maze3d", "scan"] = "maze2d"  # World to drive in.
+    seed: int = 2000  # Maze or building to drive through.
+    frames: int = 100_000  # Frames of the drive, a multiple of ``every``.
+    every: int = 1000  # Frames that are summed up in one point of the curves.
+    window: int = 2000  # Frames that are optimised together; a lidar has no window.
+    key_frames: int = 128  # Key frames from before the window; a lidar has no window.
     iterations_per_step: int = 1
     """Iterations of an optimisation that one frame pays for, as in ngo_node; 0: all at once."""
-    plot: Path = ROOT / "docs" / "images" / "online_100000.png"
-    """Picture of the curves."""
-    cache: Path = CACHE
-    """Folder for the drive, which is made once, and the curves as JSON."""
+    plot: Path = ROOT / "docs" / "images" / "online_100000.png"  # Picture of the curves.
+    cache: Path = CACHE  # Folder for the drive, which is made once, and the curves as JSON.
 
     def __post_init__(self) -> None:
         if self.every < 8 or self.frames % self.every or self.frames < 20 * self.every:

@@ -65,23 +65,16 @@ _LEAST_REPEATS = 2
 class Arguments:
     """What to measure."""
 
-    worlds: tuple[Literal["maze2d", "maze3d"], ...] = ("maze2d", "maze3d")
-    """Worlds to measure in."""
-    seed: int = 2000
-    """Maze to drive through."""
-    window: int = 2000
-    """Frames in the window, which is full when latencies are measured."""
-    live: int = 840
-    """Frames that are then sent at 35 Hz."""
+    worlds: tuple[Literal["maze2d", "maze3d"], ...] = ("maze2d", "maze3d")  # Worlds to measure in.
+    seed: int = 2000  # Maze to drive through.
+    window: int = 2000  # Frames in the window, which is full when latencies are measured.
+    live: int = 840  # Frames that are then sent at 35 Hz.
     repeats: int = 32
     """Meta-poses at the end of the full window at which the optimizer and its peers are timed: from one run of the
     network to the next."""
-    end_to_end_frames: int = 1000
-    """Frames through simulator, local_node and ngo_node as fast as they go."""
-    latency_frames: int = 700
-    """Frames through all of them at 35 Hz."""
-    out: Path = CACHE
-    """Folder for drives, which are made once, logs and recordings."""
+    end_to_end_frames: int = 1000  # Frames through simulator, local_node and ngo_node as fast as they go.
+    latency_frames: int = 700  # Frames through all of them at 35 Hz.
+    out: Path = CACHE  # Folder for drives, which are made once, logs and recordings.
 
     def __post_init__(self) -> None:
         if self.repeats < _LEAST_REPEATS or self.window < 8 * (self.repeats + 2) or self.window % 8:

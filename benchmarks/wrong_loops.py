@@ -32,8 +32,7 @@ _CASES.append(("random", 30, 20_000, True))
 class Arguments:
     """What to solve."""
 
-    seed: int = 0
-    """Of the graphs."""
+    seed: int = 0  # Of the graphs.
 
 
 def measure(seed: int) -> list[dict[str, str | float | bool]]:

@@ -42,22 +42,14 @@ class Arguments(Folders):
 
     tables: tuple[Literal["logs", "buildings", "loops", "joins", "car"], ...] = ("logs",)
     """Tables to measure: changed logs, changed simulated buildings, loops of poor wheels, wrong joins, a car's loop."""
-    logs: Path | None = None
-    """Folder of real logs with relations as NAME.relations, for the table of logs."""
-    car: Path | None = None
-    """Recording whose end lies on its own way, for the table of the car."""
-    logs_named: tuple[str, ...] = ()
-    """Logs to measure, by a part of their name; none: all."""
-    changes: tuple[str, ...] = ()
-    """Changes to measure, by name; none: all."""
-    seeds: tuple[int, ...] = (0, 1, 2)
-    """Seeds of the changes."""
-    rows: tuple[str, ...] = ()
-    """Rows to measure, by name; none: all but those of the ablation, without_*."""
-    drives: int = 20
-    """Simulated drives in each row of the tables of buildings, loops and joins."""
-    length: float = 1.0
-    """Factor on the length of simulated drives."""
+    logs: Path | None = None  # Folder of real logs with relations as NAME.relations, for the table of logs.
+    car: Path | None = None  # Recording whose end lies on its own way, for the table of the car.
+    logs_named: tuple[str, ...] = ()  # Logs to measure, by a part of their name; none: all.
+    changes: tuple[str, ...] = ()  # Changes to measure, by name; none: all.
+    seeds: tuple[int, ...] = (0, 1, 2)  # Seeds of the changes.
+    rows: tuple[str, ...] = ()  # Rows to measure, by name; none: all but those of the ablation, without_*.
+    drives: int = 20  # Simulated drives in each row of the tables of buildings, loops and joins.
+    length: float = 1.0  # Factor on the length of simulated drives.
     split: Literal["validation", "test"] = "test"
     """Buildings to drive in. Designs are chosen on validation; test is for the final tables alone."""
 

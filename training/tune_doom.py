@@ -63,8 +63,7 @@ class Arguments:
     frames: int = 1000  # Frames of a drive.
     weights: Path = records.WEIGHTS  # Folder with doom/*.safetensors, which gets the optimizer.
     out: Path = records.ROOT / "training" / "results"  # Folder that gets doom.gtsam.json.
-    runs: Path = records.ROOT / "runs"
-    """Folder of what is kept of each drive."""
+    runs: Path = records.ROOT / "runs"  # Folder of what is kept of each drive.
 
 
 def main(arguments: Arguments) -> None:

@@ -83,8 +83,7 @@ class Arguments:
     """Folder with WORLD/place_encoder.safetensors, and the odometry smoother for what is smoothed."""
     out: Path = records.ROOT / "training" / "results"
     """Folder that gets WORLD.gtsam.json, of another form WORLD.gtsam_FORM.json."""
-    runs: Path = records.ROOT / "runs"
-    """Folder of WORLD/features/."""
+    runs: Path = records.ROOT / "runs"  # Folder of WORLD/features/.
 
 
 class Objective:

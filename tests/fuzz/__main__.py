@@ -28,16 +28,11 @@ SERVICES = "services of ngo_node"
 class Arguments:
     """How much to try."""
 
-    files: int = 1000
-    """Mutants of files, shared by the kinds of files."""
-    messages: int = 5000
-    """Messages, shared by the nodes."""
-    services: int = 500
-    """Calls of services."""
-    seed: int = 0
-    """Seed of everything random."""
-    only: str = ""
-    """One target alone, by its name."""
+    files: int = 1000  # Mutants of files, shared by the kinds of files.
+    messages: int = 5000  # Messages, shared by the nodes.
+    services: int = 500  # Calls of services.
+    seed: int = 0  # Seed of everything random.
+    only: str = ""  # One target alone, by its name.
 
 
 def one(name: str, count: int, seed: int) -> dict[str, float]:

@@ -47,8 +47,7 @@ class JudgedProblem:
     problem: GraphProblem
     truth: np.ndarray
     right: np.ndarray
-    least_ate_m: float = 0.0
-    """An error below which a graph counts as solved, where the truth is itself a solution."""
+    least_ate_m: float = 0.0  # An error below which a graph counts as solved, where the truth is itself a solution.
 
     def ate_m(self, poses: np.ndarray) -> float:
         """Root mean square distance (m) of poses ``(nodes, 3)`` after the best alignment."""

@@ -29,26 +29,19 @@ from ngo_estimator.networks.place_encoder import PairHead
 class LoopSearch:
     """Which pairs of frames become loop candidates."""
 
-    per_pose: int = 4
-    """Candidates at most for each meta-pose."""
-    most: int = 512
-    """Candidates at most of a whole trajectory: those with the highest belief."""
-    min_separation: int = 6
-    """Meta-poses at least between a meta-pose and its candidates."""
-    min_apart: int = 1
-    """Candidates of one meta-pose are more than so many meta-poses from each other."""
-    views: int = 5
-    """Pairs of frames around a candidate between which it is measured."""
+    per_pose: int = 4  # Candidates at most for each meta-pose.
+    most: int = 512  # Candidates at most of a whole trajectory: those with the highest belief.
+    min_separation: int = 6  # Meta-poses at least between a meta-pose and its candidates.
+    min_apart: int = 1  # Candidates of one meta-pose are more than so many meta-poses from each other.
+    views: int = 5  # Pairs of frames around a candidate between which it is measured.
     registrations: int = 0
     """Steps of a registration by ranges, for candidates and for odometry that is good enough; 0 for none."""
     overlaps: int = 0
     """Candidates more, where poses say that frames see the same (``overlaps.find_overlaps``); 0 for none."""
-    least_belief: float = 0.0
-    """Loops that a judge holds for less likely are left out (``loop_judge``); 0 for no judge."""
+    least_belief: float = 0.0  # Loops that a judge holds for less likely are left out (``loop_judge``); 0 for no judge.
     drift_m: float = 0.0
     """Drift of the odometry in the first step between (m): it limits candidates; 0 for candidates from anywhere."""
-    drift_rad: float = 0.0
-    """The same of the heading (rad); see ``may_show_one_place``."""
+    drift_rad: float = 0.0  # The same of the heading (rad); see ``may_show_one_place``.
 
     def __post_init__(self) -> None:
         check(self, "per_pose most min_separation", "at least 1", lambda x: x >= 1)
