@@ -25,11 +25,11 @@ POSES = np.array([(float(min(k, 19 - k)), 0.0, 0.0 if k < 10 else np.pi) for k i
 
 
 def loop(earlier: int, later: int, off_m: float = 0.0) -> ScanLoops:
-    """A loop of two keys in one place, which look in opposite directions."""
+    """A loop of two keys in one place, which look in opposite directions; half a deviation from the graph's pose."""
+    evidence = np.where(np.array(EVIDENCE) == "disagreement", 0.5, 0.0)[None]
     return ScanLoops(
-        np.array(((earlier, later),)), np.array(((off_m, 0.0, np.pi),)), np.eye(3)[None], np.zeros((1, len(EVIDENCE))),
-        np.zeros(1, bool),
-    )  # fmt: skip
+        np.array(((earlier, later),)), np.array(((off_m, 0.0, np.pi),)), np.eye(3)[None], evidence, np.zeros(1, bool)
+    )
 
 
 def test_neighbours_that_agree_count_for_each_other() -> None:
@@ -132,7 +132,7 @@ def test_wrong_shapes_are_refused() -> None:
     ("settings", "name", "value"),
     [
         (ScanLoopConfig, "every", 0),
-        (ScanLoopConfig, "least_agreeing", -1),
+        (ScanLoopConfig, "most_per_key", -1),
         (ScanLoopConfig, "least_response", 1.5),
         (ScanLoopConfig, "range_m", math.inf),
         (ScanLoopConfig, "search_factor", 0.5),

@@ -76,8 +76,8 @@ def test_every_row_has_settings_of_its_own() -> None:
 def test_a_change_goes_down_the_dots_and_an_unknown_name_is_an_error() -> None:
     from ngo_estimator.loops.scan_settings import ScanGraphConfig
 
-    config = changed(ScanGraphConfig(), {"kernel": 7.0, "loops.least_agreeing": 0})
-    assert (config.kernel, config.loops.least_agreeing) == (7.0, 0)
+    config = changed(ScanGraphConfig(), {"kernel": 7.0, "loops.every": 4})
+    assert (config.kernel, config.loops.every) == (7.0, 4)
     assert ScanGraphConfig().kernel != 7.0
     with pytest.raises(TypeError):
         changed(ScanGraphConfig(), {"kernal": 7.0})

@@ -1,4 +1,4 @@
-"""Neighbouring loops of key scans that agree with each other: a loop is accepted when enough of them do."""
+"""Neighbouring loops of key scans that agree with each other: the more a loop would change, the more must agree."""
 
 import math
 
@@ -32,6 +32,5 @@ def with_agreement(config: ScanLoopConfig, loops: ScanLoops, known: int, poses: 
         ]
         evidence[agree, _AGREEING] += 1.0
         evidence[k, _AGREEING] += len(agree)
-    needed = np.maximum(config.least_agreeing, config.agreeing_per_deviation * evidence[:, _DISAGREEMENT])
-    accepted = evidence[:, _AGREEING] >= needed
+    accepted = evidence[:, _AGREEING] >= config.agreeing_per_deviation * evidence[:, _DISAGREEMENT]
     return ScanLoops(pairs, loops.relative, loops.covariance, evidence, accepted)

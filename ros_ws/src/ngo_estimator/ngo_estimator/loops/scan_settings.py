@@ -33,9 +33,9 @@ class ScanLoopConfig:
     least_on_lines: float = 0.6  # Inlier ratio at least: of the points those on lines of the submap, 0 to 1.
     most_seen_through: float = 0.15  # Share at most of the sightings that lead through walls, 0 to 1.
     most_disagreement: float = 3.0  # Distance at most from the graph's pose (deviations).
-    least_agreeing: int = 1  # Loops of other keys nearby that must agree, at least.
     agreeing_per_deviation: float = 2.0
-    """The same for each deviation from the graph's pose: the more a loop would change, the more must agree."""
+    """Loops of other keys nearby that must agree, for each deviation from the graph's pose: the more a loop would
+    change, the more must agree."""
     neighbour_keys: int = 12  # Keys at both ends up to which a loop is nearby.
     agreement_m: float = 0.25  # Difference of positions at which loops still agree (m).
     agreement_deg: float = 4.0  # Difference of headings at which they still do (degrees).
@@ -43,7 +43,7 @@ class ScanLoopConfig:
     def __post_init__(self) -> None:
         counts = "every place_step submap_keys source_keys search_points most_submaps"
         check(self, counts, "at least 1", lambda x: x >= 1)
-        check(self, "most_per_key least_agreeing neighbour_keys", "at least 0", lambda x: x >= 0)
+        check(self, "most_per_key neighbour_keys", "at least 0", lambda x: x >= 0)
         ratios = "least_response most_second least_on_lines most_seen_through"
         check(self, ratios, "a ratio from 0 to 1", lambda x: 0.0 <= x <= 1.0)
         lengths = "least_gap_m reach_m range_m agreement_m agreement_deg agreeing_per_deviation"
