@@ -98,6 +98,8 @@ Errors (m, deg) without one part of it: a hypothesis of the motion, or a step. T
 def _ablation(table: dict[str, Any]) -> str:
     ablated = {change: rows for change, rows in table.items() if any(row.startswith("without_") for row in rows)}
     names = dict.fromkeys(row for rows in ablated.values() for row in rows if row.startswith("without_"))
+    if not names:
+        return ""
     body = [
         [
             row.replace("_", " "),

@@ -64,7 +64,7 @@ class Pipeline:
     """Our estimators with the shipped settings, and what a row changes of them.
 
     ``wheels`` are listened to where the robot has any. ``odometry`` and ``graph`` are changes of the front end and of
-    the back end, by the setting's name with dots: ``{"loops.least_agreeing": 0}``.
+    the back end, by the setting's name with dots: ``{"loops.every": 4}``.
     """
 
     wheels: bool = True
@@ -305,8 +305,7 @@ _FRONT_ABLATION: dict[str, dict[str, Any]] = {
     "wide_windows": {"most_window_m": 0.4},
     "usual_misfit": {"usual_misfit": 1e-9},
     "lost": {"lost_share": 1e-9},
-    "segments": {"lost_m": 1e9, "lost_rad": 1e9, "silent_s": 1e9},
-    "early_keys": {"new_share": 1e-9},
+    "segments": {"lost": 1e9, "silent_s": 1e9},
 }
 """What the front end does, and the settings without it."""
 

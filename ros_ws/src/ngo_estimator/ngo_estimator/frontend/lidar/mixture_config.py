@@ -44,30 +44,22 @@ class MixtureConfig:
     prior_weight: float = 0.025  # of the prior's logarithm against a mean score, which is less where scans usually fit:
     usual_misfit: float = 0.05  # what their points usually lack to 1, below which it is
     search_points: int = 120
-    least_window_m: float = 0.4
-    least_window_deg: float = 10.0
     most_window_m: float = 2.5
     heading_step_deg: float = 1.25
-    apart_m: float = 0.3  # modes closer than this are one
+    apart_m: float = 0.3  # modes closer than this are one; windows are half as wide again at least
     apart_deg: float = 6.0
     margin: float = 3.0  # of log likelihoods, up to which the second mode counts
     noise: float = 0.5  # log likelihood by which a mode of the search must be better than where a hypothesis leads
-    same_m: float = 0.05  # poses closer than this are one
-    same_rad: float = 0.03
 
     # Lost, and segments.
     lost_share: float = 0.6  # of the usual score, below which what was seen before contradicts a scan
-    lost_m: float = 0.8  # dead reckoning after which a segment begins
-    lost_rad: float = 0.5
-    doubted: float = 3.0  # factor on the deviations of dead reckoning to a new segment
+    lost: float = 0.8  # dead reckoning (m, rad) after which a segment begins
     silent_s: float = 4.0  # of scans and wheels, after which a segment begins
-    open_m: float = 5.0  # deviations to a segment after silence
-    open_rad: float = 1.0
 
     # Key scans.
     key_m: float = 0.3
     key_deg: float = 15.0
-    new_share: float = 0.8  # of the usual score, below which one comes earlier
+    new_share: float = 0.8  # of the usual score, below which the search goes on in a wider window
     submap_scans: int = 20
 
     cells: ScoreFieldConfig = field(default_factory=ScoreFieldConfig)

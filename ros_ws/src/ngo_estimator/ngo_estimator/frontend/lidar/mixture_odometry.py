@@ -89,6 +89,7 @@ class MixtureOdometry:
         self._reckoned = np.zeros(2)  # way and turn since a scan fitted
         self._usual = 0.0  # score, once a scan was matched
         self._doubt = self._doubted_key = np.zeros((3, 3))  # that other modes leave: of this scan, of a last key scan
+        self._same = config.cells.cell_m, math.radians(config.heading_step_deg)  # poses closer than this are one
         last = config.icp
         self._last_steps = replace(
             last, annealing_steps=1, first_kernel_m=last.last_kernel_m, first_gate_m=last.last_gate_m
@@ -129,13 +130,11 @@ class MixtureOdometry:
             pose, covariance = self.mixture.foretold(before, self._covariance)
             self.mixture.take(self.mixture.heaviest, before, pose, covariance, None)
             segment = silent or self._is_gone(pose, covariance)
-            if segment:
-                covariance = config.doubted**2 * covariance
-                if silent:
-                    covariance += np.diag((config.open_m**2, config.open_m**2, config.open_rad**2))
+            if segment:  # at least as far away as it was looked for
+                covariance = covariance + np.diag((config.most_window_m**2, config.most_window_m**2, math.pi**2))
                 self._submap.clear()
                 self._reckoned, self._doubt = np.zeros(2), np.zeros((3, 3))
-            return self._accepted(scan, pose, covariance, 0.0, True, segment)
+            return self._accepted(scan, pose, covariance, True, segment)
         step, walls = between(before, found.pose), turned_covariance(-before[2], found.walls)
         covariance = found.found.covariance
         self.mixture.learn(step, walls)
@@ -143,14 +142,14 @@ class MixtureOdometry:
         self._reckoned = np.zeros(2)
         rate = min(0.1, math.hypot(step[0], step[1]) + abs(step[2])) if self._usual else 1.0
         self._usual += rate * (found.score - self._usual)
-        return self._accepted(scan, found.pose, covariance, found.score)
+        return self._accepted(scan, found.pose, covariance)
 
     def _is_gone(self, pose: Array, covariance: Array) -> bool:
         """Whether too much was dead reckoned to go on: by its way and turn, or by the deviation of where it led."""
         step = between(self._pose, pose)
         self._reckoned = self._reckoned + (math.hypot(step[0], step[1]), abs(step[2]))
         deviations = np.sqrt((0.5 * (covariance[0, 0] + covariance[1, 1]), covariance[2, 2]))
-        return bool((np.maximum(self._reckoned, deviations) > (self.config.lost_m, self.config.lost_rad)).any())
+        return bool((np.maximum(self._reckoned, deviations) > self.config.lost).any())
 
     def _swept_again(
         self, scan: KeyScan, found: _Mode, again: Callable[[Array], KeyScan | None]
@@ -167,16 +166,16 @@ class MixtureOdometry:
         return (other, refound) if refound.score >= found.score else (scan, found)
 
     def _accepted(
-        self, scan: KeyScan, pose: Array, covariance: Array, score: float, unsure: bool = False, segment: bool = False
+        self, scan: KeyScan, pose: Array, covariance: Array, unsure: bool = False, segment: bool = False
     ) -> RelativeStep:
-        """The step to a scan of a pose ``(3,)`` and its ``covariance``; ``score`` is how well it fits, 0 to 1."""
+        """The step to a scan of a pose ``(3,)`` and its ``covariance``."""
         config, last, key = self.config, self._pose, None
         step_covariance = turned_covariance(-last[2], covariance + self._covariance) + _LEAST
         self._pose, self._covariance, since_key = pose, covariance, between(self._key, pose)
         key_way, key_turn = math.hypot(since_key[0], since_key[1]), abs(since_key[2])
         far = max(key_way / config.key_m, key_turn / math.radians(config.key_deg))
         self._doubted_key = np.zeros((3, 3))
-        if segment or (not unsure and (far >= 1.0 or (far > 0.3 and score < config.new_share * self._usual))):
+        if segment or (not unsure and far >= 1.0):
             shared = turned_covariance(-self._key[2], covariance + self.mixture.filter.shared()) + _LEAST
             self._submap.add(scan, pose)
             walls = self._submap.walls(transformed(pose, scan.points))
@@ -286,13 +285,13 @@ class MixtureOdometry:
         return _widened(modes[0], self._doubt)
 
     def _is_same(self, a: Array, b: Array) -> bool:
-        return bool(_near(a, b, self.config.same_m, self.config.same_rad))
+        return bool(_near(a, b, *self._same))
 
     def _starts(self) -> list[int]:
         """The hypotheses but anything, without those that say no more than one before."""
-        mixture, same = self.mixture, (self.config.same_m, self.config.same_rad)
+        mixture = self.mixture
         usable, deviations = np.array(mixture.usable[:-1], dtype=int), mixture.deviations
-        distinct: list[int] = usable[_distinct(mixture.steps[usable], deviations[usable], *same)].tolist()
+        distinct: list[int] = usable[_distinct(mixture.steps[usable], deviations[usable], *self._same)].tolist()
         return distinct
 
     def _window(self, prior: Mixture, reach: int) -> tuple[Array, tuple[float, float]]:
@@ -303,7 +302,7 @@ class MixtureOdometry:
             return centre, most
         last = len(prior.means) - (reach == LIKELY)
         metres, radians = _reach(prior.means[:last], prior.deviations[:last], centre)
-        least = config.least_window_m, math.radians(config.least_window_deg)
+        least = 1.5 * config.apart_m, 1.5 * math.radians(config.apart_deg)  # or no second mode is seen
         return centre, (min(max(metres, least[0]), most[0]), min(max(radians, least[1]), most[1]))
 
     def _fit(self, few: KeyScan, hypothesis: int, start: Array | None, weight: float, wide: bool = False) -> _Mode:
