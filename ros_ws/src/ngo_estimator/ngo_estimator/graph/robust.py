@@ -118,13 +118,33 @@ def with_copies_once(problem: GraphProblem) -> GraphProblem:
 
 def _from_nothing(problem: GraphProblem, report: Progress, least_scale: float) -> CorrectedGraph:
     """The best of the solutions that begin at the chain."""
-    area, scale, inlier_ratio = map_area(problem.poses), 1.0, 0.5
-    chain, scaled = chain_poses(problem.steps.relative, problem.poses[0]), problem
-    metric = problem.loops.degrees == 3
-    if metric.any():
-        scale, inlier_ratio = scale_and_inlier_ratio(ChainUncertainty(problem.steps), problem.loops[metric], area)
+    scale, inlier_ratio = 1.0, 0.5
+    metric = problem.loops[problem.loops.degrees == 3]
+    if len(metric):
+        chain, area = ChainUncertainty(problem.steps), map_area(problem.poses)
+        scale, inlier_ratio = scale_and_inlier_ratio(chain, metric, area)
         scale = _noticed(scale, least_scale)
-        scaled = problem.scaled(scale)
+    solution = _searched(problem, scale, inlier_ratio, report, least_scale)
+    found = solution.loop_scale
+    if scale in (1.0, found):
+        return solution
+    # Cycles with the chain have its errors in common and measure a scale roughly; residuals of the solution do it well.
+    polished = _polished(problem, solution.poses, found, len(problem.loops), least_scale)
+    if scale <= _MISSTATED * max(found, solution.step_scale):
+        return polished
+    # Wrong loops near each other along the chain made up such large variances, and all that followed.
+    believed = float(np.clip((polished.loop_weights > 0.0).mean(), 0.05, 0.95))
+    anew = _searched(problem, found, believed, report, least_scale)
+    wide, narrow = ([truncated_cost(problem, each.poses, by, by) for each in (anew, polished)] for by in (scale, found))
+    return anew if wide[0] < wide[1] and narrow[0] < narrow[1] else polished
+
+
+def _searched(
+    problem: GraphProblem, scale: float, inlier_ratio: float, report: Progress, least_scale: float
+) -> CorrectedGraph:
+    """The best of the solutions with variances so many times as large as stated."""
+    area, scaled, metric = map_area(problem.poses), problem.scaled(scale), problem.loops.degrees == 3
+    chain = chain_poses(problem.steps.relative, problem.poses[0])
     odds = cycle_odds(ChainUncertainty(scaled.steps), scaled.loops, area, inlier_ratio)
     begun, solutions, count = replace(scaled, poses=chain), [], np.count_nonzero(odds > 0.0)
     # Of whole relative poses the likeliest are right; of places they are where the chain is short.
@@ -147,11 +167,7 @@ def _from_nothing(problem: GraphProblem, report: Progress, least_scale: float) -
         poses = graduate(everything, chain, report=report, structure=structure)[0]
         best = min(best, poses, key=lambda poses: truncated_cost(scaled, poses))
     solution = _polished(problem, best, scale, len(problem.loops), least_scale)
-    solution = _reconsidered(problem, solution, report, least_scale)
-    # Cycles with the chain have its errors in common and measure a scale roughly; residuals of the solution do it well.
-    if scale not in (1.0, solution.loop_scale):
-        solution = _polished(problem, solution.poses, solution.loop_scale, len(problem.loops), least_scale)
-    return solution
+    return _reconsidered(problem, solution, report, least_scale)
 
 
 def _with_wider_loops(problem: GraphProblem, solution: CorrectedGraph, least_scale: float) -> CorrectedGraph:
