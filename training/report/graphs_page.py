@@ -13,25 +13,26 @@ Made by `{command}` at {revisions}.
 
 {summary}
 
-`peer solves more` counts cells in which some peer solves a larger share. How to read the tables:
+`peer solves more` counts cells in which some peer solves a larger share. There is no learned row:
+[four networks were tried](explanation/learned_correctors.md), and none ships. How to read the tables:
 
 - **Solved** is a graph whose error (ATE after the best alignment) is below 1.5 times that of its right loops alone.
   Manhattan's truth is itself a solution, with its own loops: there an error below 0.5 m counts as solved.
-- A **cell**'s name is the kind of its wrong loops and their percentage. `_place`: loops know no relative pose, only "the
-  same place". `hard_` graphs have a poor odometry, and twice as many loops as `synthetic_` ones.
-- **Seconds** are computing time, so that a busy machine does not change them. A peer that computes for longer than its
-  limit (30 or 60 s) is stopped: it counts as not solved, and its error is that of the odometry.
-- A loop is **believed** where the poses fit it within its stated threshold. All peers get the stated covariances; those
-  of Manhattan are far too large.
+- A **cell**'s name is the kind of its wrong loops and their percentage. `_place`: loops know no relative pose, only
+  "the same place". `hard_` graphs have a poor odometry, and twice as many loops as `synthetic_` ones.
+- **Seconds** are computing time, so that a busy machine does not change them. A peer that computes for longer than
+  its limit (30 or 60 s) is stopped: it counts as not solved, and its error is that of the odometry.
+- A loop is **believed** where the poses fit it within its stated threshold. All peers get the stated covariances;
+  those of Manhattan are far too large.
 - **Cheapest** is the share of graphs where the truncated cost of what was found is not above that of the right loops'
-  solution. A graph that is not solved there has a cheaper wrong solution: no search for a lower cost would find the right
-  one.
-- In `GRAPH_online` loops come in blocks of 120, in the order of their later poses, and numbers are means over the blocks.
-  There `robust` goes on from its last solution, and `robust_anew` begins anew in each block; `changed` is the share of
-  verdicts about known loops that changed.
-- Rows and cells that are missing were not measured: `--graphs`, `--kinds`, `--percents`, `--seeds` and `--rows` measure a
-  part. `graphs.json` has each number of each cell, with intervals of 95 % and how many graphs there were: slow peers have
-  one of Manhattan, not three.
+  solution. A graph that is not solved there has a cheaper wrong solution: no search for a lower cost would find the
+  right one.
+- In `GRAPH_online` loops come in blocks of 120, in the order of their later poses, and numbers are means over the
+  blocks. There `robust` goes on from its last solution, and `robust_anew` begins anew in each block; `changed` is the
+  share of verdicts about known loops that changed.
+- Rows and cells that are missing were not measured: `--graphs`, `--kinds`, `--percents`, `--seeds` and `--rows`
+  measure a part. `graphs.json` has each number of each cell, with intervals of 95 % and how many graphs there were:
+  slow peers have one of Manhattan, not three.
 
 | kind | wrong loops |
 |---|---|
@@ -41,40 +42,6 @@ Made by `{command}` at {revisions}.
 | lookalike | between stretches of fifty nodes that look alike |
 | offset | right ones, shifted by 3 m, all in the same way, drawn with replacement: at 70 % each is there 2.6 times |
 """
-
-_LEARNED = """## Learned correctors
-
-None ships: lidars, cameras and `optimize_graph` have the robust corrector, and mazes keep the paper's network, which is
-[judged apart](explanation/results.md). Four designs were trained on graphs that the project draws: up to 3,400
-nodes, five kinds of wrong loops, mis-stated covariances. Each proposes a solution, and the truncated cost judges between
-it and that of the robust corrector.
-
-| Design | Parameters | Training | What it gives |
-|---|---|---|---|
-| Corrector: belief in each loop by attention among loops, then a solution, M times | 85,653 | 12 min on a busy processor | nothing: 34 of 41 drawn graphs, as without it; without attention its cross-entropy is lower (0.136, with it 0.250) |
-| Order in which loops are let in | 19,962 | 102 s | 18 of 22 test graphs, the robust corrector alone 19 |
-| Judge of solutions | 13,464 | 18 s | nothing since copies of a loop count once |
-| Order of loops, with what 96 others say of each | 62,094 (0.26 MB) | 280 s, one H200 GPU | more graphs, and too slow: see below |
-
-The last one on 77 validation graphs; 1.5 times the time was the limit:
-
-| | Solved | Time |
-|---|---|---|
-| Robust corrector | 68 | 1 |
-| With attention, three seeds | 75, 76, 75 | 2.8 |
-| No bias by what two loops say of each other | 75 | |
-| No attention | 75 | 2.0 |
-| Trained on the first view alone | 75, and one lost | |
-| A second view after the first solution (M = 2) | 74 to 76, one lost with two of three seeds | |
-| Hand rule: seven of its numbers, logistic regression; 26 other graphs | 20, the robust corrector 19 | 1.7 |
-
-So attention solves no more than the same numbers without it. On seven test graphs (3,333 nodes, 75 % look-alike places)
-the robust corrector solved 3, attention 5, no attention 6. The robust corrector has since learned to ask refused loops
-again, which the networks were not compared with. On Lecture Hall attention is near uniform: right loops spend 28 to 68 %
-of it on right partners, where uniform attention would spend 50 %. The networks are not kept, so there is no picture. More
-is in the [notebook](notebook.md#pose-graphs-with-wrong-loops).
-"""
-
 
 _OWN = ("odometry", "right_loops", "robust", "robust_anew")
 """Rows that are no peers."""
@@ -106,11 +73,11 @@ def page(result: dict[str, Any]) -> str:
                 np.divide(*(np.mean([cell[row][key]["mean"] for cell in both]) for row in ("robust", "gtsam_gnc")))
                 for key in ("ate_m", "seconds")
             )
-            parts.append(f"`robust` beside GNC anew in each block: {error:.2f} of its error, {seconds:.3f} of its time.\n")
+            parts.append(f"`robust` has {error:.2f} of the error of GNC in each block, in {seconds:.3f} of its time.\n")
         if graph in result.get("pictures", {}):
             name, cell = result["pictures"][graph]
             parts.append(f"`{cell}`: {CAPTION}\n\n![Verdicts about the loops of {graph} as they come](images/{name})\n")
-    return "\n".join([*parts, _LEARNED])
+    return "\n".join(parts).rstrip() + "\n"
 
 
 def _summary(tables: dict[str, Any]) -> str:
