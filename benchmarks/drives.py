@@ -25,11 +25,9 @@ from training.data.batches import seen_from_first
 from training.data.features import features_of
 from training.data.worlds import MazeSize, world_named
 
-SIZES = {"maze2d": MazeSize(7, 8), "maze3d": MazeSize()}
-"""The mazes that are driven through."""
+SIZES = {"maze2d": MazeSize(7, 8), "maze3d": MazeSize()}  # The mazes that are driven through.
 
-PERIOD_NS = 28_571_429
-"""Time between two stamps: 35 Hz."""
+PERIOD_NS = 28_571_429  # Time between two stamps: 35 Hz.
 
 CACHE = ROOT / "runs" / "benchmarks"
 _CHUNK = 1000

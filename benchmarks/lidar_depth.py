@@ -54,8 +54,7 @@ SENSORS = {
     "stereo, 12 cm at 5 m": Sensor(farthest_m=10.0, growth=0.005),
 }
 
-_HEIGHT_M = 0.5
-"""Of a 3D lidar above the floor."""
+_HEIGHT_M = 0.5  # Of a 3D lidar above the floor.
 
 WHEELS = WheelsConfig(left_bias=0.02, slips_per_km=60.0)
 

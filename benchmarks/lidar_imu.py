@@ -24,8 +24,7 @@ from training.data.building_drives import lidar_drive
 from training.data.lidar_drives import TruePoses, simulated_stamps_ns
 
 _RATE_HZ = 100.0
-_NOISE_RPS, _BIAS_RPS = 0.005, 0.02
-"""Deviation and bias of a cheap gyroscope's reading."""
+_NOISE_RPS, _BIAS_RPS = 0.005, 0.02  # Deviation and bias of a cheap gyroscope's reading.
 
 VARIANTS = ("none", "right", "wrong sign", "0.1 s late", "0.3 s late", "noise alone")
 

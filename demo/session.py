@@ -29,17 +29,13 @@ from training.common.records import WEIGHTS
 from training.recordings.recorder import Recorder
 
 START_TIMEOUT_S = 180.0  # the first start after an installation compiles
-SILENCE_TIMEOUT_S = 60.0
-"""How long nothing at all may come through before a run counts as stuck."""
+SILENCE_TIMEOUT_S = 60.0  # How long nothing at all may come through before a run counts as stuck.
 
-MAP_INTERVAL_S = 2.0
-"""Whole maps are recorded: a few are enough."""
+MAP_INTERVAL_S = 2.0  # Whole maps are recorded: a few are enough.
 
-MAP = "map"
-"""Name of the map's files."""
+MAP = "map"  # Name of the map's files.
 
-Show = Callable[[str, int], None]
-"""Called with what is going on and how many frames are through."""
+Show = Callable[[str, int], None]  # Called with what is going on and how many frames are through.
 
 
 @dataclass(frozen=True)

@@ -37,8 +37,7 @@ from training.data.worlds import OPTIMIZER_TRAIN_SEEDS, TRAIN_SEEDS, VALIDATION_
 from training.recordings.recording_source import SourceArguments, inputs_of, open_source
 from training.recordings.recording_streams import RecordedSteps
 
-CALIBRATION_MAZES = 64
-"""Mazes that the output of a world's network is calibrated in."""
+CALIBRATION_MAZES = 64  # Mazes that the output of a world's network is calibrated in.
 
 
 @dataclass(frozen=True)

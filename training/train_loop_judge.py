@@ -41,15 +41,12 @@ SEARCH = LoopSearch(
 )
 """Loops for each meta-pose and of all: belief tells so little that true ones are anywhere among them."""
 
-TRUE_M, TRUE_RAD = 0.6, 0.175
-"""How far off a loop may be that joins one place."""
+TRUE_M, TRUE_RAD = 0.6, 0.175  # How far off a loop may be that joins one place.
 
-_FIRST_SEED = 190
-"""Of the optimizer's: the memory learned from those before."""
+_FIRST_SEED = 190  # Of the optimizer's: the memory learned from those before.
 _MOST_DRIVES = 110
 _SCALE_WEIGHT = 0.3
-_WEIGHT_DECAY = 0.1
-"""With less, and with more steps, what it said of validation maps became worse."""
+_WEIGHT_DECAY = 0.1  # With less, and with more steps, what it said of validation maps became worse.
 _FLOOR_M, _FLOOR_RAD = 0.01, 0.002
 
 

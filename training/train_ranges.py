@@ -28,8 +28,7 @@ from training.common.training import descend, save_weights
 from training.data.doom_drives import doom_episodes
 from training.data.worlds import OPTIMIZER_TRAIN_SEEDS, VALIDATION_SEEDS
 
-_FIRST_SEED = 300
-"""Of the optimizer's: the memory and the judge of loops learn from those before."""
+_FIRST_SEED = 300  # Of the optimizer's: the memory and the judge of loops learn from those before.
 _LEAST_SURE = 0.6
 """Share of sure ranges below which a picture has none: mazes have 93 %, maps that nobody trained on 26 %."""
 _SMALLEST_M, _LARGEST_M = 0.05, 140.0
@@ -37,8 +36,7 @@ _BRIGHTNESS = 0.15
 _WEIGHT_DECAY = 1e-2
 """Of little variety heads learn the maps by heart: with a tenth of it, ranges of other maps were 21.4 % off, not 20."""
 
-Frames = tuple[Tensor, Tensor]
-"""Images ``(n, height, width, channels)``, and the ranges of each ``(n, rays)`` (m)."""
+Frames = tuple[Tensor, Tensor]  # Images ``(n, height, width, channels)``, and the ranges of each ``(n, rays)`` (m).
 
 
 @dataclass(frozen=True)

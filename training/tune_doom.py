@@ -34,25 +34,20 @@ from training.scoring.doom_rows import Features, gtsam_graph, local, ours
 from training.scoring.metrics import WITHIN_DEVIATIONS, absolute_error_m, off_by
 from training.scoring.online_estimate import with_origin
 
-BELIEFS = (0.7, 0.8, 0.9)
-"""Least likelihood of a loop."""
-STEP_SCALES = ((0.25, 0.25, 0.5), (0.25, 0.25, 1.0))
-"""Factors of the deviations of steps (x, y, yaw)."""
+BELIEFS = (0.7, 0.8, 0.9)  # Least likelihood of a loop.
+STEP_SCALES = ((0.25, 0.25, 0.5), (0.25, 0.25, 1.0))  # Factors of the deviations of steps (x, y, yaw).
 LOOP_SCALES = (0.0, -0.5)
 """Stretch of the deviations of a loop's position: the information gets the factor exp(4 tanh(x / 2))."""
 DRIFTS = ((0.0, 0.0), (0.06, 0.0075), (0.12, 0.0075))
 """What the odometry drifts in a step (m, rad) for GTSAM: how far away candidates may lie; (0, 0): anywhere."""
-FIRST_MAZE, FEWER = 900, 12
-"""Of the validation seeds, the first that drives in a maze, and how many do."""
-WANTED = 0.97
-"""Share of the published poses within three deviations."""
+FIRST_MAZE, FEWER = 900, 12  # Of the validation seeds, the first that drives in a maze, and how many do.
+WANTED = 0.97  # Share of the published poses within three deviations.
 MOST_HARM = 1.05
 """Largest ratio of the mean error on a map to that of the odometry.
 
 True loops may give a drive a larger error: where the odometry turned wrongly in one place, the correction is spread.
 """
-HARM_BELOW_M = 0.2
-"""Errors that small do not count as harm."""
+HARM_BELOW_M = 0.2  # Errors that small do not count as harm.
 
 
 @dataclass(frozen=True)

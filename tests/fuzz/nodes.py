@@ -41,8 +41,7 @@ _ANSWER_TURNS = 500
 _SHARES = (0.0, 0.0, 0.03, 0.2, 1.0)
 _FINAL = State.PRIMARY_STATE_FINALIZED
 
-Make = Callable[[int], Any]
-"""A good message, stamped for its number."""
+Make = Callable[[int], Any]  # A good message, stamped for its number.
 
 
 @contextmanager

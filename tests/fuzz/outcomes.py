@@ -9,8 +9,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from types import FrameType
 
-LIMIT_S = 10.0
-"""An input that takes longer counts as a hang."""
+LIMIT_S = 10.0  # An input that takes longer counts as a hang.
 
 
 class Hang(BaseException):

@@ -16,8 +16,7 @@ from tests.golden.net import FIRST_STAMP_NS, JITTER, STORED, Run, save_arrays
 from training.data.lidar_drives import TruePoses
 
 WEIGHTS = net.WEIGHTS
-WORLDS = ("maze2d", "maze3d")
-"""Whose first drive is one of each world that other tests use."""
+WORLDS = ("maze2d", "maze3d")  # Whose first drive is one of each world that other tests use.
 
 
 @dataclass(frozen=True, eq=False)

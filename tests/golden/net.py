@@ -15,8 +15,7 @@ from training.scoring.lidar_errors import absolute_error_m, covariance_errors
 STORED = Path(__file__).parent / "stored"
 WEIGHTS = Path(__file__).parents[2] / "ros_ws/src/ngo_estimator/weights"
 FIRST_STAMP_NS = 1_000_000_000
-JITTER = 1e-6
-"""By how much at most a copy's ranges differ (m), and the values of its pictures that are no bytes."""
+JITTER = 1e-6  # By how much at most a copy's ranges differ (m), and the values of its pictures that are no bytes.
 
 
 @dataclass(frozen=True, eq=False)

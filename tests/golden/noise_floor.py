@@ -29,8 +29,7 @@ FLOOR, PATHS = (Path(__file__).parent / name for name in ("noise_floor.json", "p
 COPIES = 5
 SCORES = tuple(score.name for score in fields(Scores))
 
-MULTIPLE = 2.0
-"""A score may be so many times as far from the stored drive's as that of the copy that is farthest."""
+MULTIPLE = 2.0  # A score may be so many times as far from the stored drive's as that of the copy that is farthest.
 
 LEAST = Scores(ate_m=2e-4, odometry_ate_m=2e-4, within=0.01, nll=0.02, moved_m=1e-3)
 """How far a score may be off where no copy is: one pose in a hundred, and covariances of which each is 1 % larger.

@@ -34,8 +34,7 @@ pytestmark = pytest.mark.processes
 FRAMES = 60
 STEP_NS = 100_000_000
 WARM_UP_NS, BEGIN_NS = 1_000_000_000_000, 5_000_000_000_000
-UNMOUNTED = 5
-"""Scans that come before the scanner's mounting does."""
+UNMOUNTED = 5  # Scans that come before the scanner's mounting does.
 ANGLES = np.radians(np.arange(-120.0, 120.5, 1.0))
 MOUNTING = np.array([0.12, -0.05, math.radians(30.0)])
 RELIABLE = {"world": "scan", "image_reliability": "reliable", "image_depth": 1000}

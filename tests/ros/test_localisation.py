@@ -30,8 +30,7 @@ from .relative_poses import Optimizer
 
 pytestmark = pytest.mark.processes
 
-START = 110
-"""Frame at which the robot is switched on again."""
+START = 110  # Frame at which the robot is switched on again.
 
 
 @dataclasses.dataclass

@@ -42,8 +42,7 @@ def poses(frames: int, bend: float = 0.0) -> np.ndarray:
     return np.column_stack((np.cumsum(0.1 * np.cos(yaw)), np.cumsum(0.1 * np.sin(yaw)), yaw)) - [0.1, 0.0, 0.0]
 
 
-CORRECTED = poses(30, 0.01) + [0.3, -0.2, 0.0]
-"""Every pose has moved by more than a cell."""
+CORRECTED = poses(30, 0.01) + [0.3, -0.2, 0.0]  # Every pose has moved by more than a cell.
 
 
 def key_scan(frame: int) -> KeyScan:

@@ -26,8 +26,7 @@ from training.common.precision import Precision
 from training.data import episodes, streams, worlds
 from training.scoring.table_rows import Sources
 
-PRECISION: Precision = "32-true"
-"""With "auto" each training would first measure which one is faster."""
+PRECISION: Precision = "32-true"  # With "auto" each training would first measure which one is faster.
 
 
 def shrink(monkeypatch: pytest.MonkeyPatch, frames: int, place_frames: int) -> None:

@@ -20,8 +20,7 @@ DEEPVO = "deepvo"
 _HIDDEN = 1000  # units of an LSTM layer at width 1, as in the paper
 _LAYERS = 2
 
-State = tuple[Tensor, Tensor]
-"""Hidden and cell state of the LSTM layers, ``(layers, sequences, units)`` each."""
+State = tuple[Tensor, Tensor]  # Hidden and cell state of the LSTM layers, ``(layers, sequences, units)`` each.
 
 
 @dataclass(frozen=True)

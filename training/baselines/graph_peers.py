@@ -19,16 +19,14 @@ from ngo_estimator.graph.corrector import GraphProblem, thresholds
 from ngo_estimator.graph.cycle_agreement import ChainUncertainty
 from ngo_estimator.graph.relative_poses import RelativePoses
 
-_UNKNOWN_STD = 1e3
-"""Deviation (rad) that GTSAM gets for a heading of which nothing is known."""
+_UNKNOWN_STD = 1e3  # Deviation (rad) that GTSAM gets for a heading of which nothing is known.
 
 _CAUCHY, _DCS, _GEMAN_MCCLURE = 3.0, 1.0, 3.0
 _INLIER_PROBABILITY = 0.99
 _ANCHOR_STD, _TOLERANCE = 1e-6, 1e-6
 _SEEDS = 20  # nodes where a search for a clique begins
 
-Peer = Callable[[GraphProblem], np.ndarray]
-"""Poses ``(nodes, 3)`` of a problem."""
+Peer = Callable[[GraphProblem], np.ndarray]  # Poses ``(nodes, 3)`` of a problem.
 
 
 def cauchy(problem: GraphProblem) -> np.ndarray:

@@ -9,8 +9,7 @@ from torch import nn
 Precision = Literal["auto", "bf16-mixed", "32-true"]
 Resolved = Literal["bf16-mixed", "32-true"]
 
-GAIN = 1.25
-"""How many times faster bfloat16 has to be: it also rounds."""
+GAIN = 1.25  # How many times faster bfloat16 has to be: it also rounds.
 _ROUNDS = 3
 
 

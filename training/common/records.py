@@ -22,8 +22,7 @@ def kept_details(description: dict[str, Any]) -> dict[str, Any]:
     return {name: value for name, value in description.items() if name not in _OWN}
 
 
-_WRITTEN = ("docs", "training/results")
-"""Where tables write: the next cell is measured by the same code."""
+_WRITTEN = ("docs", "training/results")  # Where tables write: the next cell is measured by the same code.
 
 
 class RunError(ValueError):

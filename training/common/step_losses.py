@@ -8,10 +8,8 @@ from torch.nn.functional import smooth_l1_loss
 
 from ngo_estimator.geometry import se2
 
-HEADING_WEIGHT = 3.0
-"""Weight of a turn in the loss, beside 1 for each component of the position."""
-LIKELIHOOD_WEIGHT = 0.1
-"""Weight of the likelihood of the stated deviations, beside the loss on poses."""
+HEADING_WEIGHT = 3.0  # Weight of a turn in the loss, beside 1 for each component of the position.
+LIKELIHOOD_WEIGHT = 0.1  # Weight of the likelihood of the stated deviations, beside the loss on poses.
 
 
 def windows_within(steps: int, windows: tuple[int, ...]) -> tuple[int, ...]:

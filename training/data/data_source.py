@@ -6,8 +6,7 @@ from ngo_estimator.data.images import ImageFormat
 from ngo_estimator.geometry.scan_registration import RegistrationConfig
 from ngo_estimator.loops.loop_closure import LoopSearch
 
-TRAIN_STORE = "train"
-"""The feature store that smoother and optimizer learn from."""
+TRAIN_STORE = "train"  # The feature store that smoother and optimizer learn from.
 
 OTHER_TRAIN_STORE = "train_policy"
 """The one that the optimizer learns from as well, in worlds with an ``optimizer_driver``."""

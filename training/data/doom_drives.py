@@ -20,8 +20,7 @@ from training.data.worlds import OPTIMIZER_TRAIN_SEEDS, TRAIN_SEEDS, WORLDS
 Watch = Callable[[Any, np.ndarray], None]
 """What is called with the world and the observation of each frame, and may ask the world for its walls."""
 
-Map = tuple[str, str]
-"""A WAD file that ViZDoom ships, and the name of a map in it."""
+Map = tuple[str, str]  # A WAD file that ViZDoom ships, and the name of a map in it.
 
 TRAIN_MAPS: tuple[Map, ...] = (
     *(("freedoom2.wad", f"MAP{number:02}") for number in range(1, 17)),
@@ -39,11 +38,9 @@ TEST_MAPS: tuple[Map, ...] = (
 )  # fmt: skip
 """All scenarios of ViZDoom that have a start for a single player; ``basic`` stands for its variants with sounds."""
 
-ROOMS: Map = ("rooms", "")
-"""Stands for the generated level of a drive's seed."""
+ROOMS: Map = ("rooms", "")  # Stands for the generated level of a drive's seed.
 
-MAZES: Map = ("mazes", "")
-"""Stands for the maze of a drive's seed."""
+MAZES: Map = ("mazes", "")  # Stands for the maze of a drive's seed.
 
 _PLACES, _PLACE_SHARES = ("map", "rooms", "maze"), (0.5, 0.3, 0.2)
 _DRIVERS = {
@@ -52,8 +49,7 @@ _DRIVERS = {
     "maze": (("random_goals", "learned", "explorer"), (0.65, 0.15, 0.2)),
 }
 _ONE_BY_ONE = (*("map",) * 4, "rooms", "rooms", "maze", "maze")
-CALIBRATION = 1000
-"""The last ones of the optimizer's seeds, which drive on the maps for validation."""
+CALIBRATION = 1000  # The last ones of the optimizer's seeds, which drive on the maps for validation.
 
 
 def map_drive(

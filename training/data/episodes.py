@@ -17,8 +17,7 @@ if TYPE_CHECKING:
     from ngo_sim.episodes import Episode
     from ngo_sim.mazes import Maze
 
-GROUP = 8
-"""Episodes that are simulated in mazes of one size before another size is drawn."""
+GROUP = 8  # Episodes that are simulated in mazes of one size before another size is drawn.
 
 
 def simulate(world: World, seeds: list[int], frames: int, size: MazeSize = DRAWN) -> Iterator[Episode]:

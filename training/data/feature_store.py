@@ -21,11 +21,9 @@ from training.data.worlds import World
 if TYPE_CHECKING:
     from ngo_sim.episodes import Episode
 
-STORED = ("relative", "log_std", "motion", "codes", "origin_code", "truth")
-"""The arrays of a feature store."""
+STORED = ("relative", "log_std", "motion", "codes", "origin_code", "truth")  # The arrays of a feature store.
 
-NETWORKS_FILE = "networks.json"
-"""File of a store with the hashes of the networks that made its features."""
+NETWORKS_FILE = "networks.json"  # File of a store with the hashes of the networks that made its features.
 
 
 def groups_of(count: int, part: int, parts: int) -> list[int]:

@@ -19,8 +19,7 @@ if TYPE_CHECKING:
 Split = Literal["validation", "test"]
 Features = dict[str, np.ndarray]
 
-STEPS = 2000
-"""Steps of each drive."""
+STEPS = 2000  # Steps of each drive.
 
 _ALIASED = MazeSize(rows=6, extra_openings=0, aliased=True)
 _ALIASED_FIRST, _SECOND_FIRST = 25, 50  # among the seeds: of aliased mazes, and of the second drives

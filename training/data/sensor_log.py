@@ -11,8 +11,7 @@ from ngo_estimator.geometry.scan_points import Mounting
 from ngo_recordings.scan_stream import LidarScan, WheelPose
 from training.data.lidar_drives import LidarDrive, Reference, TruePoses
 
-FAR_AWAY_M = 10_000.0
-"""From one place to the next in the truth of drives that were put together."""
+FAR_AWAY_M = 10_000.0  # From one place to the next in the truth of drives that were put together.
 
 
 @dataclass(frozen=True, eq=False)

@@ -20,10 +20,8 @@ from ngo_common.waiting import waiting_messages
 from ngo_recordings.errors import RecordingError
 from ngo_recordings.writer import RecordingWriter
 
-_BUNCH_S = 0.02
-"""Messages of so long are taken together."""
-_MOST = 100
-"""Messages of one topic that are taken together."""
+_BUNCH_S = 0.02  # Messages of so long are taken together.
+_MOST = 100  # Messages of one topic that are taken together.
 
 Listener = Callable[[bytes, int, int], None]
 """Called with the serialised message, and when it was published and received (wall clock, ns)."""

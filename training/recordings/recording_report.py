@@ -18,16 +18,11 @@ from ngo_recordings.images import CLOUD_TYPE, SCAN_TYPE
 from ngo_recordings.recording import Message, Recording
 from ngo_recordings.topics import POSE_TYPES, TF_TYPE, RecordingTopics, transform_topics
 
-REVISIT_M = 1.0
-"""A place is visited again where the path comes this close to where it was before..."""
-REVISIT_AFTER_M = 5.0
-"""...after at least this long a way."""
-FEW_REVISITS = 0.05
-"""Share of the frames; with less there is little to learn loops from."""
-FEW_FRAMES = 200
-"""Of one recording."""
-SAMPLES = 6
-"""How many images of a recording are kept to be shown."""
+REVISIT_M = 1.0  # A place is visited again where the path comes this close to where it was before...
+REVISIT_AFTER_M = 5.0  # ...after at least this long a way.
+FEW_REVISITS = 0.05  # Share of the frames; with less there is little to learn loops from.
+FEW_FRAMES = 200  # Of one recording.
+SAMPLES = 6  # How many images of a recording are kept to be shown.
 _REVISIT_FRAMES = 5000
 _GAP = 3.0
 _LONGEST_SIMULATION_S = 365.0 * 24.0 * 3600.0

@@ -29,8 +29,7 @@ from training.recordings.recording_tracks import PARTS, SHORTEST, Part, Split, T
 
 NO_LOOPS = "no_loops"
 """Key in the JSON beside a place encoder or an optimizer with which no loops are closed; its value says why."""
-FEWEST_STEPS = 200
-"""Of the networks' part; fewer teach nothing."""
+FEWEST_STEPS = 200  # Of the networks' part; fewer teach nothing.
 _PANORAMA = math.pi
 _NARROW = math.radians(35.0)
 

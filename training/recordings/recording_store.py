@@ -25,10 +25,8 @@ from ngo_recordings.recording import open_recording
 from ngo_recordings.topics import GroundTruth, TopicArguments, choose_topics
 from training.data.data_source import MIRRORED_ACTIONS
 
-MOST_COLUMNS = 96
-"""Pictures that are wider are made smaller, by the least whole factor."""
-MOST_RAYS = 289
-"""A scan's format has at most as many rays."""
+MOST_COLUMNS = 96  # Pictures that are wider are made smaller, by the least whole factor.
+MOST_RAYS = 289  # A scan's format has at most as many rays.
 _INDEX = "store.json"
 _VERSION = 1
 _NO_ACTION = -1

@@ -18,10 +18,8 @@ from training.data.data_source import Domain
 from training.recordings.recording_source import RecordedData
 from training.recordings.recording_tracks import Track
 
-REPEATS = 2
-"""How often an epoch shows each pair of frames, at most."""
-FEWEST_PLACES = 50
-"""Frames that must be seen from where the robot was before, for places to be learned."""
+REPEATS = 2  # How often an epoch shows each pair of frames, at most.
+FEWEST_PLACES = 50  # Frames that must be seen from where the robot was before, for places to be learned.
 _BATCHES_AN_EPOCH = 100  # at least, where there are enough pairs: small data wants small batches
 _SMALLEST_BATCH = 32
 _MOST_PAIRS = 200_000

@@ -20,8 +20,7 @@ PARTS: tuple[Part, ...] = ("train", "optimizer", "validation", "test")
 
 GAP_S = 2.0
 """Between two parts of one recording nothing is used for so long: frames on either side of a border look alike."""
-SHORTEST = 16
-"""Frames of a track."""
+SHORTEST = 16  # Frames of a track.
 _LONG_STEP = 2.5  # times the usual one: frames are missing
 
 

@@ -4,8 +4,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-Entry = Mapping[str, Any]
-"""``{mean, ci95}``; the interval may be None."""
+Entry = Mapping[str, Any]  # ``{mean, ci95}``; the interval may be None.
 
 
 @dataclass(frozen=True)

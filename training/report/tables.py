@@ -11,8 +11,7 @@ from training.scoring.scores import METRICS
 from training.scoring.statistics import compare, mean_interval
 from training.scoring.table import Measured
 
-Table = Mapping[str, Sequence[Measured]]
-"""The measurements of each row, one for each training seed."""
+Table = Mapping[str, Sequence[Measured]]  # The measurements of each row, one for each training seed.
 
 PAIRS = (
     ("smoothed", "local"),

@@ -23,8 +23,7 @@ METRICS = ("translation_percent", "ate_m", "within_3_std")
 
 _AGO = 48
 
-Features = dict[str, np.ndarray]
-"""Of one drive, as of ``features_of``."""
+Features = dict[str, np.ndarray]  # Of one drive, as of ``features_of``.
 
 
 @dataclass(frozen=True)

@@ -11,17 +11,13 @@ import torch
 
 from ngo_estimator.geometry import se2
 
-FRAMES = 60
-"""Frames of a start."""
+FRAMES = 60  # Frames of a start.
 
-IN_TIME = 50
-"""Frames within which a success counts."""
+IN_TIME = 50  # Frames within which a success counts.
 
-MOST_M, MOST_DEG = 0.5, 5.0
-"""Errors up to which a pose is right."""
+MOST_M, MOST_DEG = 0.5, 5.0  # Errors up to which a pose is right.
 
-NUMBERS = ("success", "false_claims", "frames", "heading_rmse_deg", "wrong_later", "lost")
-"""What is said of a start."""
+NUMBERS = ("success", "false_claims", "frames", "heading_rmse_deg", "wrong_later", "lost")  # What is said of a start.
 
 _LEAST_MAPPED = 0.9  # share of the frames in time that lie where the map has frames
 

@@ -21,8 +21,7 @@ from training.data.lidar_drives import LidarDrive
 from training.scoring.kidnapped import MOST_DEG, MOST_M, KnownMap, MapErrors
 from training.scoring.lidar_rows import DriveRuns, Pipeline
 
-WAY_M = 30.0
-"""Way of a start."""
+WAY_M = 30.0  # Way of a start.
 
 _MAPPED_WAY_M = 10.0  # of a start that must lie where the map has key scans
 _LEAST_MAPPED = 0.9

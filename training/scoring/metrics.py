@@ -7,8 +7,7 @@ import numpy as np
 from ngo_estimator.geometry import se2
 from training.data.batches import seen_from_first
 
-WITHIN_DEVIATIONS = 3.0
-"""Deviations within which an honest estimate has the truth."""
+WITHIN_DEVIATIONS = 3.0  # Deviations within which an honest estimate has the truth.
 
 
 @dataclass(frozen=True)

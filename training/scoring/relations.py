@@ -13,8 +13,7 @@ import numpy as np
 
 from training.data.lidar_drives import Relations
 
-FAR_S = 30.0
-"""Relations that span more than this tell of loops, shorter ones of odometry."""
+FAR_S = 30.0  # Relations that span more than this tell of loops, shorter ones of odometry.
 
 _INSIDE_S = 0.01  # by which a relation may begin before the estimate, or end after it
 

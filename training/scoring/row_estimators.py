@@ -25,8 +25,7 @@ from training.baselines.loop_factors import MoreLoops, Seen
 from training.baselines.pose_graph import PoseGraphSettings, optimize
 from training.scoring.table_rows import ROWS, Sources
 
-Arrays = dict[str, np.ndarray]
-"""Arrays of a feature store ``(trajectories, steps, ...)``."""
+Arrays = dict[str, np.ndarray]  # Arrays of a feature store ``(trajectories, steps, ...)``.
 
 Array = TypeVar("Array", np.ndarray, Tensor)
 

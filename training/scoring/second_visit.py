@@ -9,10 +9,8 @@ from scipy.spatial import KDTree
 from ngo_estimator.geometry.planar_motion import Array, compose, rotated, transformed
 from training.scoring.metrics import rigid_motion
 
-STRETCH_M = 20.0
-"""Way at the end of a drive that is the second visit."""
-APART_M = 100.0
-"""Least way from the first visit to the second."""
+STRETCH_M = 20.0  # Way at the end of a drive that is the second visit.
+APART_M = 100.0  # Least way from the first visit to the second.
 
 _EVERY_M = 0.5  # of way: a scan
 _CELL_M = 0.25

@@ -27,8 +27,7 @@ class Bar:
         return {"name": self.name, "value": self.value, "at_most": self.most, "met": self.met}
 
 
-StressLogs = Mapping[str, Mapping[str, Mapping[str, Mapping[str, Any]]]]
-"""``LOG.CHANGE.ROW.KEY`` as in the JSON."""
+StressLogs = Mapping[str, Mapping[str, Mapping[str, Mapping[str, Any]]]]  # ``LOG.CHANGE.ROW.KEY`` as in the JSON.
 
 _TIMES_CLEAN = 1.3
 _LESS_SEEN = {"noise_5cm": 1.6, "range_5m": 1.6, "quarter_of_rays": 1.6}

@@ -21,10 +21,8 @@ from training.scoring.relations import interpolated, relation_errors
 from training.scoring.table import Drive, Measured, Row, measure
 
 CLEAN = "clean"
-BLIND_TO_WHEELS = ("ours_without_wheels", "kiss_icp")
-"""Rows that no change of the wheels reaches."""
-AT_SCANS_S = 0.02
-"""A relation is at a scan where one was taken so close to each of its ends."""
+BLIND_TO_WHEELS = ("ours_without_wheels", "kiss_icp")  # Rows that no change of the wheels reaches.
+AT_SCANS_S = 0.02  # A relation is at a scan where one was taken so close to each of its ends.
 
 _CODE = (lidar_changes, lidar_logs)
 _ROWS = ROWS | FRONT_ABLATION

@@ -20,8 +20,7 @@ from ngo_common.files import written_whole
 from training.common.source_code import code_digest
 from training.scoring.statistics import mean_interval
 
-Numbers = dict[str, dict[str, Any]]
-"""``{mean, ci95}`` by the metric's key."""
+Numbers = dict[str, dict[str, Any]]  # ``{mean, ci95}`` by the metric's key.
 
 
 @dataclass(frozen=True)
@@ -69,8 +68,7 @@ class Row:
 
 
 Rows = Mapping[str, Row]
-Table = dict[str, dict[str, Measured]]
-"""By the drive's name, then the row's."""
+Table = dict[str, dict[str, Measured]]  # By the drive's name, then the row's.
 
 
 def measure(plan: Sequence[tuple[Drive, Rows]], folder: Path, title: str = "", known_only: bool = False) -> Table:

@@ -10,8 +10,7 @@ from ngo_estimator.geometry.view_pose import camera_at
 SIZE_M = np.array((8.0, 6.0, 3.0))
 _CELL_M = 0.12
 PLAIN = np.random.default_rng(5).integers(0, 256, (6, 80, 80)).astype(np.float64)
-TILES = np.tile(PLAIN[:, :3, :3], (1, 27, 27))[:, :80, :80]
-"""Paint of walls that repeat each 0.36 m."""
+TILES = np.tile(PLAIN[:, :3, :3], (1, 27, 27))[:, :80, :80]  # Paint of walls that repeat each 0.36 m.
 
 
 def camera(width: int = 320) -> CameraModel:

@@ -15,8 +15,7 @@ def read_file(path: Path) -> bytes:
     return path.read_bytes()
 
 
-PARTIAL = ".partial"
-"""Ending of files that a crash left unfinished; their names are ``.NAME.ANYTHING.partial``."""
+PARTIAL = ".partial"  # Ending of files that a crash left unfinished; their names are ``.NAME.ANYTHING.partial``.
 
 
 def write_whole(path: Path, content: bytes | str | Iterable[bytes]) -> None:

@@ -22,11 +22,9 @@ from ngo_sim.doom_map import UNITS_PER_M
 from ngo_sim.doom_wad import Lump, read_wad, write_lumps
 from ngo_sim.doom_walls import walls_at
 
-SHIPPED = Path(vizdoom.__file__).parent
-"""Where ViZDoom keeps the two games of freedoom, and below it its scenarios."""
+SHIPPED = Path(vizdoom.__file__).parent  # Where ViZDoom keeps the two games of freedoom, and below it its scenarios.
 
-MAZE_GAME = SHIPPED / "freedoom2.wad"
-"""The game that the mazes take their textures from."""
+MAZE_GAME = SHIPPED / "freedoom2.wad"  # The game that the mazes take their textures from.
 
 # Of the fixed list of sizes that ViZDoom renders those of 4:3, to which alone the camera model applies.
 RESOLUTIONS = {

@@ -16,14 +16,11 @@ from numpy.typing import NDArray
 from ngo_sim.doom_wad import Lump
 from ngo_sim.mazes import Maze
 
-UNITS_PER_M = 32.0
-"""Doom map units in one metre: the one place where the scale of the 3D world is stated."""
+UNITS_PER_M = 32.0  # Doom map units in one metre: the one place where the scale of the 3D world is stated.
 
-WALL_HEIGHT_UNITS = 128
-"""Floor to ceiling; the height of every texture below, so that each shows once and upright."""
+WALL_HEIGHT_UNITS = 128  # Floor to ceiling; the height of every texture below, so that each shows once and upright.
 
-PLAYER_RADIUS_UNITS = 16
-"""Half the side of the box with which Doom's player collides."""
+PLAYER_RADIUS_UNITS = 16  # Half the side of the box with which Doom's player collides.
 
 # Of freedoom2.wad: opaque, 128 units high, static (no animated sequence, no switch), and told apart by colour
 # or pattern even at 80 x 60 pixels.

@@ -11,11 +11,9 @@ from ngo_sim.learned_driver import LearnedDriver
 from ngo_sim.mazes import Maze
 
 _GOALS = {"corners": "corners", "random_goals": "random"}
-PLANNERS = (*_GOALS, "distance")
-"""Drivers that need a plan of the maze."""
+PLANNERS = (*_GOALS, "distance")  # Drivers that need a plan of the maze.
 
-DRIVER_NAMES = (*PLANNERS, "learned", "explorer", "random")
-"""What make_driver knows."""
+DRIVER_NAMES = (*PLANNERS, "learned", "explorer", "random")  # What make_driver knows.
 
 
 def driver_generator(seed: int) -> np.random.Generator:

@@ -30,8 +30,7 @@ from ngo_sim.drivers import Action
 from ngo_sim.mazes import Maze, check_aliased, check_maze_size, kruskal_maze, repeated_maze
 from ngo_sim.rooms_level import rooms_textmap
 
-TICS_PER_S = 35
-"""Doom's fixed rate of simulation."""
+TICS_PER_S = 35  # Doom's fixed rate of simulation.
 
 # Doom's pixels are 1.2 times as high as wide (320 x 200 of them filled a screen of 4:3), at any size.
 _PIXEL_STRETCH = 1.2

@@ -103,8 +103,7 @@ class Maze:
             raise ValueError(f"no path joins block {start} and block {goal}") from error
 
 
-MOST_CELLS = 100
-"""Rows or columns of the largest maze: a mistyped size is said at once, not met as minutes of waiting."""
+MOST_CELLS = 100  # Rows or columns of the largest maze: a mistyped size is said at once, not met as minutes of waiting.
 
 
 def check_maze_size(rows: int, cols: int, extra_openings: int) -> None:
@@ -163,8 +162,7 @@ def kruskal_maze(rows: int, cols: int, rng: np.random.Generator, extra_openings:
     return _build(rows, cols, tree, rng, extra_openings, block_m)
 
 
-MODULE_CELLS = 2
-"""Cells along a side of the module that ``repeated_maze`` repeats."""
+MODULE_CELLS = 2  # Cells along a side of the module that ``repeated_maze`` repeats.
 
 
 def check_aliased(aliased: bool, rows: int, cols: int, extra_openings: int) -> None:

@@ -26,8 +26,7 @@ Point = tuple[float, float]
 Edge = tuple[Point, int]
 """The corner at which an edge of a convex polygon begins (counter-clockwise), and the line that it lies on."""
 
-STEP_UNITS = 24
-"""The highest step that the player climbs."""
+STEP_UNITS = 24  # The highest step that the player climbs.
 
 _SIZE_M = (24.0, 70.0)
 _ROOM_M2 = (20.0, 500.0)

@@ -20,8 +20,7 @@ from ngo_estimator.graph.surest_first import believe
 from tests.unit.ngo_estimator.graph.test_corrector import STD, loop, straight
 
 STEP_STD, LOOP_STD = np.array((0.02, 0.02, 0.004)), np.array((0.05, 0.05, 0.02))
-ROUND = 60
-"""Steps of one way around a square."""
+ROUND = 60  # Steps of one way around a square.
 
 
 def square(

@@ -17,8 +17,7 @@ from ngo_recordings.frames import Frame
 from tests.unit.ngo_estimator.samples import local_config, observations, place_config, small_optimizer, small_pair_head
 
 STEP_NS = 100_000_000
-ROUNDING = 1e-6
-"""Of single precision (m, rad): networks run over several frames at once round otherwise than over one."""
+ROUNDING = 1e-6  # Of single precision (m, rad): networks run over several frames at once round otherwise than over one.
 START_NS = 1_700_000_000_000_000_000
 
 

@@ -33,8 +33,7 @@ from training.scoring.online_estimate import steps_of
 
 ORIGIN = MapOrigin.of_first_pose(np.array((1.0, -2.0, 0.5)))
 LATER_NS = 10**15
-MAZE, OTHER_MAZE = 900_000_101, 900_000_102
-"""Seeds of no training and no table."""
+MAZE, OTHER_MAZE = 900_000_101, 900_000_102  # Seeds of no training and no table.
 
 
 @dataclasses.dataclass(frozen=True)

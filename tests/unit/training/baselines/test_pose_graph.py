@@ -24,8 +24,7 @@ PLAIN = PoseGraphSettings(
     kernel="none",
     drift_m=0.0,
 )
-LAP = 16
-"""Meta-steps of a lap."""
+LAP = 16  # Meta-steps of a lap.
 NO_LOOPS = LoopFactors(np.zeros(0, int), np.zeros(0, int), np.zeros((0, 3)), np.zeros((0, 2)), np.zeros(0))
 
 

@@ -13,14 +13,12 @@ RESTART_AFTER_NS = 1_000_000_000
 LARGEST_VALUE = 1e4
 """Largest size of a coordinate (m, rad), feature or code: beyond it the optimizer's float32 has no room to compute."""
 
-LARGEST_ODOMETRY = 1e9
-"""Largest size of a coordinate (m, rad) of the pose in ``odom``, which enters in float64 only."""
+LARGEST_ODOMETRY = 1e9  # Largest size of a coordinate (m, rad) of the pose in ``odom``, which enters in float64 only.
 
 LARGEST_SCAN = 20_000
 """Most points, and most rays, of a key scan: it bounds the time and memory that a message may cost."""
 
-UNFAMILIAR = 1.0
-"""Unlikeness beyond which a frame is unlike what the networks learned from."""
+UNFAMILIAR = 1.0  # Unlikeness beyond which a frame is unlike what the networks learned from.
 
 
 class RejectedStep(ValueError):

@@ -5,8 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-ALIKE = 0.9
-"""Similarity from which on two frames look the same."""
+ALIKE = 0.9  # Similarity from which on two frames look the same.
 
 FEWEST_PLACES, LARGEST_SHARE = 10, 0.3
 """A frame that looks like at least so many places, and like more than this share of all, shows no place.

@@ -28,14 +28,11 @@ from ngo_estimator.loops.place_loops import PlaceLoops
 from ngo_estimator.loops.place_map import PlaceMap
 from ngo_estimator.networks.place_encoder import PairHead
 
-MARGIN = 4
-"""Frames before and behind a block whose codes a key frame keeps, for the views of a loop."""
+MARGIN = 4  # Frames before and behind a block whose codes a key frame keeps, for the views of a loop.
 
-_KEY_FRAMES_PER_POSE = 2
-"""Candidates among the key frames for each meta-pose."""
+_KEY_FRAMES_PER_POSE = 2  # Candidates among the key frames for each meta-pose.
 
-_MOST_TO_KEY_FRAMES = 128
-"""Most loops from key frames to the window, and most loops between key frames."""
+_MOST_TO_KEY_FRAMES = 128  # Most loops from key frames to the window, and most loops between key frames.
 
 _AGAIN = 8
 """Blocks after which what shares a frame's walls is looked for once more: its pose knows of loops that came later."""

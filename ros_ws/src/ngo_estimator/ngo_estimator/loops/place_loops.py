@@ -14,11 +14,9 @@ from ngo_estimator.loops.loop_closure import Loops
 from ngo_estimator.loops.loop_record import LoopRecord, rows
 from ngo_estimator.loops.pair_measurement import PairMeasurement
 
-UNWEIGHED = -1.0
-"""Weight of a loop that no optimisation has seen."""
+UNWEIGHED = -1.0  # Weight of a loop that no optimisation has seen.
 
-_BELIEVED = 0.1
-"""A loop with a smaller weight is forgotten when it leaves the window."""
+_BELIEVED = 0.1  # A loop with a smaller weight is forgotten when it leaves the window.
 
 
 @dataclass(frozen=True)

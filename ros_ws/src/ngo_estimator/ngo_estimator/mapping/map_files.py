@@ -13,8 +13,7 @@ from ngo_estimator.mapping.occupancy_grid import OccupancyMap
 
 FORMATS = ("pgm", "png")
 MODES = ("trinary", "scale", "raw")
-FREE, OCCUPIED = 0.25, 0.65
-"""Nav2's own thresholds."""
+FREE, OCCUPIED = 0.25, 0.65  # Nav2's own thresholds.
 
 _WHITE, _TRANSPARENT = 255, 0
 

@@ -16,8 +16,7 @@ from ngo_estimator.mapping.occupancy_grid import MapTooLarge, OccupancyConfig, O
 from ngo_estimator.mapping.range_scan import Array, RangeScan, range_scan
 
 _RAYS_AT_ONCE, _SCANS_AT_ONCE = 10_000, 256  # between two looks at the clock
-_COARSEST = 32.0
-"""Times the cells that were asked for: a map that is still too large then has scans at absurd poses."""
+_COARSEST = 32.0  # Times the cells that were asked for: a map that is still too large then has scans at absurd poses.
 
 
 @dataclass(frozen=True)

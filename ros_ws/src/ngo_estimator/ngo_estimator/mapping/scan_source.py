@@ -16,8 +16,7 @@ if TYPE_CHECKING:
 
 Stamped = tuple[int, RangeScan]
 
-_SURE_M = 0.15
-"""Ranges are used as far as their deviation stays below this, where no largest range is given."""
+_SURE_M = 0.15  # Ranges are used as far as their deviation stays below this, where no largest range is given.
 
 
 class ScanSource(Protocol):

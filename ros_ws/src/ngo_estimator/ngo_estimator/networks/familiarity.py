@@ -18,11 +18,9 @@ from ngo_estimator.networks.place_encoder import PlaceEncoder
 DISTANCES = ("look", "motion", "told", "change")
 """The distances of an observation, in the order of ``Familiarity.distances``."""
 
-NO_LIMIT = 1e9
-"""Limit of a distance that tells nothing."""
+NO_LIMIT = 1e9  # Limit of a distance that tells nothing.
 
-HISTORY = 12
-"""Latest actions from which the motion is told."""
+HISTORY = 12  # Latest actions from which the motion is told.
 
 _COLUMNS = 4  # of the picture, each with statistics of its own
 _GAIN = 5.0  # of the early features before their logarithm

@@ -11,8 +11,7 @@ from ngo_estimator.data.images import ImageFormat, to_network
 from ngo_estimator.networks.flownet import FlowNetConvolutions
 from ngo_estimator.networks.odometry_smoothing import OdometrySmoother, SmootherConfig
 
-NO_ACTION = -1
-"""In place of an action that was not taken, or that nobody knows."""
+NO_ACTION = -1  # In place of an action that was not taken, or that nobody knows.
 
 
 @dataclass(frozen=True)

@@ -12,8 +12,7 @@ from torch.nn.functional import pad
 
 from ngo_estimator.data.configuration import check, check_positive
 
-_UNIT = 0.1
-"""Correction of a step by a head that says 1, in units of ``relative_std``."""
+_UNIT = 0.1  # Correction of a step by a head that says 1, in units of ``relative_std``.
 _LARGEST_INPUT = 10.0
 """Steps of more ``relative_std``, as where frames were lost, look to their neighbours as if they had so many."""
 

@@ -16,8 +16,7 @@ from ngo_estimator.data.images import ImageFormat, to_network
 from ngo_estimator.geometry.scan_registration import RegistrationConfig, Scans, register
 from ngo_estimator.networks.flownet import FlowNetConvolutions
 
-_UNSURE = -2.0
-"""Logarithm of the scale from which on a range that was learned to see is left out: an eighth of itself."""
+_UNSURE = -2.0  # Logarithm of the scale from which on a range that was learned to see is left out: an eighth of itself.
 
 
 @dataclass(frozen=True)

@@ -17,8 +17,7 @@ from ngo_estimator.nodes.messages import to_ns
 from ngo_estimator.nodes.settings import NgoNodeSettings
 from ngo_estimator.nodes.status import NodeStatus
 
-AT_ONCE = 8
-"""Relative poses that are taken in one turn of the executor where a node fell behind."""
+AT_ONCE = 8  # Relative poses that are taken in one turn of the executor where a node fell behind.
 
 # The graph learns of a publisher before it learns its node's name: nothing is said before that.
 _UNKNOWN = "a node of a name not known yet"

@@ -33,10 +33,8 @@ class Arguments:
 
     sessions: Annotated[tuple[Path, ...], tyro.conf.Positional]
     """Folders of saved states, two or more; the first one gives the map."""
-    out: Path
-    """Folder to write the joined state to."""
-    weights: Path | None = None
-    """Folder of weights of your own, with which the sessions were made."""
+    out: Path  # Folder to write the joined state to.
+    weights: Path | None = None  # Folder of weights of your own, with which the sessions were made.
 
     def check(self) -> None:
         """Raise ``ValueError`` for arguments that no run can have."""

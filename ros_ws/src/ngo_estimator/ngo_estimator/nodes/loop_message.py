@@ -19,12 +19,10 @@ _WIDTH_M = 0.03
 _COLORS = np.array(((0.1, 0.5, 0.9), (0.95, 0.6, 0.1), (0.85, 0.1, 0.15)))
 """Of loops that are believed, doubted and refused."""
 
-_FAINTEST = 0.3
-"""Opacity of a loop that is not believed: what is refused is to be seen."""
+_FAINTEST = 0.3  # Opacity of a loop that is not believed: what is refused is to be seen.
 
 _STAMP = np.dtype([("sec", np.int32), ("nanosec", np.uint32)])
-_STAMP_AT = 8
-"""Behind the encapsulation and the number of markers, 4 bytes each."""
+_STAMP_AT = 8  # Behind the encapsulation and the number of markers, 4 bytes each.
 
 
 class LoopMarkerWriter:

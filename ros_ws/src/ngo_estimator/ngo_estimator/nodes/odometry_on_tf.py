@@ -9,8 +9,7 @@ import numpy as np
 from ngo_estimator.data.relative_step import RelativeStep
 from ngo_recordings.transform_buffer import TransformBuffer
 
-_WAIT_NS = 2_500_000_000
-"""Transforms that are later by the scans' stamps are not waited for."""
+_WAIT_NS = 2_500_000_000  # Transforms that are later by the scans' stamps are not waited for.
 
 _SAID_AFTER_NS = 1_500_000_000
 

@@ -24,8 +24,7 @@ from ngo_estimator.trajectory.report import Report, ReportSettings, trajectory_r
 from ngo_recordings.writer import RecordingWriter
 
 PATHS = {"odometry": "/odom/path", "corrected": "/ngo/path", "truth": "/ground_truth/path"}
-PART = "part"
-"""Folders of the second trajectory of a recording and those after it have this name, and a number."""
+PART = "part"  # Folders of the second trajectory of a recording and those after it have this name, and a number.
 
 _FILES = (
     "odometry.tum",

@@ -5,8 +5,7 @@ from dataclasses import dataclass
 
 from ngo_common.settings import BadParameter, FramedSettings, frame, pose, setting, topic, topics
 
-CAMERA_WORLD = "camera"
-"""Any calibrated camera, without weights; with weights it is a name as any other."""
+CAMERA_WORLD = "camera"  # Any calibrated camera, without weights; with weights it is a name as any other.
 
 SHIPPED_WORLDS = ("maze2d", "maze3d", "doom", "scan", CAMERA_WORLD)
 """Worlds that need no weights but those in the package."""

@@ -16,8 +16,7 @@ from ngo_common.nodes.qos import overridable
 from ngo_estimator.nodes.messages import to_time
 from ngo_estimator.nodes.settings import StepSettings
 
-_QUIET_S = 5.0
-"""Least time between two warnings of one kind."""
+_QUIET_S = 5.0  # Least time between two warnings of one kind.
 
 
 class NodeStatus:

@@ -22,12 +22,10 @@ TYPES = {
 }
 """Types of the topics."""
 
-Serialise = Callable[[Any], bytes]
-"""Turns a message into bytes."""
+Serialise = Callable[[Any], bytes]  # Turns a message into bytes.
 
 _NS = 1_000_000_000
-_HEAD = 4
-"""Bytes that say how a message is encoded: a stamp, or the number of transforms, comes behind them."""
+_HEAD = 4  # Bytes that say how a message is encoded: a stamp, or the number of transforms, comes behind them.
 
 
 class OdometryWriter:

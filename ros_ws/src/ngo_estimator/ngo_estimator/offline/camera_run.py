@@ -12,8 +12,7 @@ from ngo_recordings.frames import Frame
 from ngo_recordings.scan_stream import WheelPose
 
 _UNPLACED = "no odometry at their stamps"
-_AHEAD_NS = 500_000_000
-"""Odometry is given so far ahead of a picture."""
+_AHEAD_NS = 500_000_000  # Odometry is given so far ahead of a picture.
 
 
 class CameraRun(Run):

@@ -19,18 +19,14 @@ from ngo_recordings.scan_stream import ImuReading, LidarScan, WheelPose
 LidarRecord = LidarScan | WheelPose | ImuReading
 
 _MOST_WALL_POINTS = 400_000
-_LEAST_LAG_S = 0.005
-"""An age of scans that is said."""
+_LEAST_LAG_S = 0.005  # An age of scans that is said.
 
 _LEARNED_SCANS = 600
-_LEARNED_M, _LEARNED_RAD = 6.0, 6.0
-"""Way and turn after which faults of scanners and wheels are known."""
+_LEARNED_M, _LEARNED_RAD = 6.0, 6.0  # Way and turn after which faults of scanners and wheels are known.
 
-_LOST_SHARE = 0.01
-"""Of the first scans: with so many that do not say where they were taken, wheels are doubted."""
+_LOST_SHARE = 0.01  # Of the first scans: with so many that do not say where they were taken, wheels are doubted.
 
-_TO_BLAME = 0.5
-"""Without wheels that are to blame, fewer scans than this share of those get lost."""
+_TO_BLAME = 0.5  # Without wheels that are to blame, fewer scans than this share of those get lost.
 
 
 class LidarRun(Run):

@@ -17,8 +17,7 @@ _HALF_M = np.array([6.0, 4.0])  # of the room
 _STEP_M = 0.35
 _STEPS = 60
 _OWN_RAYS, _OWN_M = 4, 0.15  # rays that see the robot itself, and how far away
-_SILENT = range(3, 13)
-"""Steps without wheels: without them other things are run."""
+_SILENT = range(3, 13)  # Steps without wheels: without them other things are run.
 
 
 def warm_up_odometry() -> list[RelativeStep]:

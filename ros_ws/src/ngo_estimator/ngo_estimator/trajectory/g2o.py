@@ -19,11 +19,9 @@ from ngo_estimator.graph.relative_poses import RelativePoses
 from ngo_estimator.slam.trajectory_update import Trajectory
 from ngo_estimator.trajectory.files import write_lines
 
-GRAPH_ENDING = ".g2o"
-"""Of the files of this module."""
+GRAPH_ENDING = ".g2o"  # Of the files of this module.
 
-UNSTAMPED = -1
-"""Stamp of a vertex that has none."""
+UNSTAMPED = -1  # Stamp of a vertex that has none.
 
 _NS = 1_000_000_000
 _VERTEX, _EDGE, _FIX = "VERTEX_SE2", "EDGE_SE2", "FIX"

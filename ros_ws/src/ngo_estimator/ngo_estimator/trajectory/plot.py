@@ -11,8 +11,7 @@ from matplotlib.figure import Figure
 TRUTH = "#1f6fd6"
 _COLORS = ("#2ca02c", "#ff7f0e", "#9467bd", "#d62728")
 _MOST_POINTS = 20_000
-_NARROWEST = 0.6
-"""Height of a panel in its width, or the other way round, at least: else its labels overlap."""
+_NARROWEST = 0.6  # Height of a panel in its width, or the other way round, at least: else its labels overlap.
 _LEAST_M = 0.5
 
 

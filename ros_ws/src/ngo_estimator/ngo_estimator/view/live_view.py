@@ -18,8 +18,7 @@ from ngo_recordings.laser_scan import scan_of
 from ngo_recordings.mounting import mounting_in
 from ngo_recordings.transform_buffer import TransformBuffer
 
-_ARROW_SHARE = 0.06
-"""Length of the robot's arrow as a share of half the window: seen in a room and in a building."""
+_ARROW_SHARE = 0.06  # Length of the robot's arrow as a share of half the window: seen in a room and in a building.
 
 
 class Canvas(Protocol):

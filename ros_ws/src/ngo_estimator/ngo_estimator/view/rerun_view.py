@@ -9,8 +9,7 @@ import rerun.blueprint as rrb
 
 from ngo_estimator.view.shapes import Window
 
-TRUTH, ODOMETRY, CORRECTED = (31, 111, 214), (44, 160, 44), (255, 127, 14)
-"""Colours of the demo's picture."""
+TRUTH, ODOMETRY, CORRECTED = (31, 111, 214), (44, 160, 44), (255, 127, 14)  # Colours of the demo's picture.
 COLORS = {"truth": TRUTH, "odometry": ODOMETRY, "corrected": CORRECTED}
 _SCAN, _ROBOT, _PLAN = (214, 39, 40), (0, 0, 0), (148, 80, 200)
 _EYE_HEIGHT = 1.95  # times half of the window: the default field of view sees it whole
