@@ -38,9 +38,8 @@ _domain, _domain_lock = claim_domain()
 os.environ["ROS_DOMAIN_ID"] = str(_domain)
 os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
 
-# Processes that run tests side by side share the cores already. Before any test module imports torch.
-if "PYTEST_XDIST_WORKER" in os.environ:
-    os.environ.setdefault("OMP_NUM_THREADS", "1")
+# Processes that run tests side by side share the cores. Before any module imports torch.
+os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 
 # A shell that runs this in the background hands over an ignored SIGINT, which children would inherit.

@@ -5,7 +5,6 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
-import torch
 
 from tests.fuzz import files, nodes
 from tests.fuzz.outcomes import Outcomes
@@ -24,7 +23,6 @@ def assert_clean(outcomes: Outcomes, count: int) -> None:
 
 @pytest.mark.parametrize("name", files.TARGETS)
 def test_mutants_of_files(name: str, tmp_path: Path) -> None:
-    torch.set_num_threads(1)
     count = TAKES_LONG.get(name, FILES)
     outcomes = files.run(name, count, random.Random(name), tmp_path)
     assert_clean(outcomes, count)
@@ -33,14 +31,12 @@ def test_mutants_of_files(name: str, tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("name", nodes.NODES)
 def test_messages(name: str) -> None:
-    torch.set_num_threads(1)
     outcomes = nodes.run_messages(name, MESSAGES, random.Random(name))
     assert_clean(outcomes, MESSAGES)
     assert outcomes.counts["clean line"] > 0 and outcomes.counts["taken"] > 0
 
 
 def test_services_in_every_state() -> None:
-    torch.set_num_threads(1)
     assert_clean(nodes.run_services(SERVICES, random.Random(0)), SERVICES)
 
 

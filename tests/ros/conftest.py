@@ -4,7 +4,6 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-import torch
 
 from .processes import Probe
 from .relative_poses import write_weights
@@ -12,7 +11,6 @@ from .relative_poses import write_weights
 
 @pytest.fixture(scope="module")
 def weights(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    torch.set_num_threads(1)
     folder = tmp_path_factory.mktemp("weights")
     write_weights(folder)
     return folder

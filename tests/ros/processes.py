@@ -21,7 +21,7 @@ from rclpy.context import Context
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.parameter import Parameter
-from rclpy.qos import QoSProfile
+from rclpy.qos import DurabilityPolicy, QoSProfile
 
 from demo.graph import NodeSpec
 
@@ -30,6 +30,7 @@ from .node_server import Forked, NodeServer
 # Ample for a machine of its own; one that is shared may need more, and `--timeout` of pytest as well.
 TIMEOUT_S = float(os.environ.get("NGO_TEST_TIMEOUT_S", "60"))
 
+LATCHED = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 _POLL_S = 0.02
 _PYTHON_PATH = os.environ.get("PYTHONPATH")  # of the server: with another one a node imports other modules
 _ASK_AGAIN_S = 0.3  # an answer to who is not known yet never comes

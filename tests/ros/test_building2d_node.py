@@ -3,7 +3,6 @@
 import numpy as np
 import pytest
 from nav_msgs.msg import Odometry
-from rclpy.qos import DurabilityPolicy, QoSProfile
 from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import LaserScan
 from tf2_msgs.msg import TFMessage
@@ -13,7 +12,7 @@ from ngo_sim.floor_plans import FloorPlanConfig
 from ngo_sim.lidar import ScannerConfig
 from ngo_sim.wheels import WheelsConfig
 
-from .processes import NodeProcess, Probe
+from .processes import LATCHED, NodeProcess, Probe
 from .readings import stamps_ns, xyyaw
 
 pytestmark = pytest.mark.processes
@@ -25,8 +24,7 @@ WHEELS = {"lag_s": 0.15, "left_bias": 0.02}
 
 
 def test_it_publishes_what_the_core_gives(probe: Probe) -> None:
-    latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
-    mounted = probe.collect(TFMessage, "/tf_static", latched)
+    mounted = probe.collect(TFMessage, "/tf_static", LATCHED)
     wheels, truth = probe.collect(Odometry, "wheels"), probe.collect(Odometry, "ground_truth")
     clock, tf = probe.collect(Clock, "/clock"), probe.collect(TFMessage, "/tf")
     scans = probe.collect(LaserScan, "scan")

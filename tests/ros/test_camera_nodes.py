@@ -7,7 +7,6 @@ import pytest
 from geometry_msgs.msg import PoseWithCovarianceStamped, Quaternion, TransformStamped, Vector3
 from nav_msgs.msg import Odometry
 from ngo_msgs.msg import RelativePose
-from rclpy.qos import DurabilityPolicy, QoSProfile
 from scipy.spatial.transform import Rotation
 from sensor_msgs.msg import CameraInfo, Image, PointCloud2
 from tf2_msgs.msg import TFMessage
@@ -20,7 +19,7 @@ from ngo_estimator.nodes.messages import to_ns, to_time
 from ngo_estimator.slam.picture_trajectory import PictureTrajectory
 from tests.unit.ngo_estimator.rendered_room import SIZE_M, by_wheels, camera, drive, picture, rays_of
 
-from .processes import NodeProcess, Probe
+from .processes import LATCHED, NodeProcess, Probe
 
 pytestmark = pytest.mark.processes
 
@@ -69,8 +68,7 @@ def test_live_nodes_follow_a_camera_as_the_cores_do() -> None:
         steps = probe.collect(RelativePose, "relative_pose")
         poses = probe.collect(PoseWithCovarianceStamped, "ngo/pose")
         clouds = probe.collect(PointCloud2, "points")
-        latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
-        static = probe.node.create_publisher(TFMessage, "/tf_static", latched)
+        static = probe.node.create_publisher(TFMessage, "/tf_static", LATCHED)
         infos = probe.node.create_publisher(CameraInfo, "camera/camera_info", 1000)
         images = probe.node.create_publisher(Image, "camera/image_raw", 1000)
         odometry = probe.node.create_publisher(Odometry, "wheels", 1000)

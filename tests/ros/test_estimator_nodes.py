@@ -35,7 +35,6 @@ pytestmark = pytest.mark.processes
 @pytest.fixture(scope="module")
 def weights(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Untrained weights for both worlds: what these tests say does not depend on what was learned."""
-    torch.set_num_threads(1)
     folder = tmp_path_factory.mktemp("weights")
     for world in ("maze2d", "maze3d"):
         torch.manual_seed(0)

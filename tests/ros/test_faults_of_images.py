@@ -33,7 +33,6 @@ SOURCE_TIMEOUT_S = 0.5
 
 @pytest.fixture(scope="module")
 def parameters(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
-    torch.set_num_threads(1)
     torch.manual_seed(0)
     folder = tmp_path_factory.mktemp("weights")
     write_untrained(folder, "maze2d")

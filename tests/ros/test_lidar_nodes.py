@@ -10,7 +10,6 @@ from geometry_msgs.msg import PoseWithCovarianceStamped, Quaternion, TransformSt
 from nav_msgs.msg import Odometry
 from ngo_msgs.msg import RelativePose
 from ngo_msgs.srv import Reset
-from rclpy.qos import DurabilityPolicy, QoSProfile
 from sensor_msgs.msg import Imu, LaserScan
 from tf2_msgs.msg import TFMessage
 
@@ -26,7 +25,7 @@ from ngo_recordings.mounting import mounting_in
 from ngo_recordings.transform_buffer import TransformBuffer
 from tests.unit.ngo_estimator.ray_casting import ROOM, cast
 
-from .processes import NodeProcess, Probe
+from .processes import LATCHED, NodeProcess, Probe
 from .readings import xyyaw
 
 pytestmark = pytest.mark.processes
@@ -127,8 +126,7 @@ def test_live_nodes_follow_a_lidar(probe: Probe, robot_odometry: str, upside_dow
         probe.collect(PoseWithCovarianceStamped, "ngo/pose"),
         probe.collect(TFMessage, "/tf"),
     )
-    latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
-    static = probe.node.create_publisher(TFMessage, "/tf_static", latched)
+    static = probe.node.create_publisher(TFMessage, "/tf_static", LATCHED)
     scans = probe.node.create_publisher(LaserScan, "scan", 1000)
     wheels = probe.node.create_publisher(Odometry, "wheels", 1000)
     tf = probe.node.create_publisher(TFMessage, "/tf", 1000)
@@ -258,8 +256,7 @@ def test_live_nodes_follow_a_lidar(probe: Probe, robot_odometry: str, upside_dow
 
 
 def test_a_scanner_without_a_mounting_is_told_and_one_that_comes_late_counts(probe: Probe) -> None:
-    latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
-    static = probe.node.create_publisher(TFMessage, "/tf_static", latched)
+    static = probe.node.create_publisher(TFMessage, "/tf_static", LATCHED)
     relative_poses = probe.collect(RelativePose, "relative_pose")
     scans = probe.node.create_publisher(LaserScan, "scan", 1000)
     noise = np.random.default_rng(0)

@@ -36,7 +36,6 @@ WAITING = {"wait_for_flow_control": True, "wait_for_subscribers": 1}
 @pytest.fixture
 def probe() -> Iterator[Probe]:
     torch.manual_seed(0)
-    torch.set_num_threads(1)
     with Probe() as probe:
         yield probe
 

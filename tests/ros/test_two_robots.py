@@ -30,7 +30,6 @@ def placed(message: TFMessage) -> tuple[str, str, int]:
 
 def test_two_robots_drive_at_once(tmp_path: Path) -> None:
     """Each pose is what the core makes of that robot's own relative poses; on /tf the prefix tells them apart."""
-    torch.set_num_threads(1)
     torch.manual_seed(0)
     write_untrained(tmp_path, "maze2d")
     with Probe() as probe:

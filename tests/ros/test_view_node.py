@@ -11,13 +11,12 @@ import pytest
 from geometry_msgs.msg import PoseWithCovarianceStamped
 from nav_msgs.msg import OccupancyGrid, Odometry
 from ngo_msgs.msg import Trajectory
-from rclpy.qos import DurabilityPolicy, QoSProfile
 from sensor_msgs.msg import Image, LaserScan
 from visualization_msgs.msg import MarkerArray
 
 from tests.unit.ngo_estimator.view.free_ports import free_ports
 
-from .processes import TIMEOUT_S, NodeProcess, Probe
+from .processes import LATCHED, TIMEOUT_S, NodeProcess, Probe
 
 pytestmark = pytest.mark.processes
 
@@ -35,9 +34,8 @@ def test_without_rerun_it_says_what_to_install(tmp_path: Path, monkeypatch: pyte
 @pytest.mark.skipif(importlib.util.find_spec("rerun") is None, reason="rerun is an extra: requirements/view.txt")
 def test_it_shows_a_graph() -> None:
     web, data = free_ports(2)
-    latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
     topics = {
-        "map": (OccupancyGrid, latched),
+        "map": (OccupancyGrid, LATCHED),
         "image": (Image, 10),
         "scan": (LaserScan, 10),
         "odom": (Odometry, 10),

@@ -21,13 +21,11 @@ WEIGHTS = Path(__file__).parents[4] / "ros_ws/src/ngo_estimator/weights"
 
 @pytest.fixture(scope="module")
 def maze2d() -> OnlineTrajectory:
-    torch.set_num_threads(1)
     return OnlineTrajectory.load(WEIGHTS / "maze2d", world="maze2d", iterations_per_step=1)
 
 
 @pytest.fixture(scope="module")
 def maze3d() -> OnlineTrajectory:
-    torch.set_num_threads(1)
     return OnlineTrajectory.load(WEIGHTS / "maze3d", world="maze3d", iterations_per_step=1)
 
 

@@ -9,7 +9,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-import torch
 
 from ngo_estimator.data.relative_step import RelativeStep
 from ngo_estimator.frontend.camera.local_odometry import LocalOdometry
@@ -27,7 +26,6 @@ def golden(world: str) -> list[RelativeStep]:
 
 @pytest.mark.parametrize("world", WORLDS)
 def test_what_is_unfamiliar_is_left_to_the_odometry(world: str) -> None:
-    torch.set_num_threads(1)
     steps = golden(world)
     core = OnlineTrajectory.load(WEIGHTS / world, world=world)
     unfamiliar = [replace(step, unlikeness=2.0) for step in steps]
@@ -41,7 +39,6 @@ def test_what_is_unfamiliar_is_left_to_the_odometry(world: str) -> None:
 
 
 def test_a_session_with_unfamiliar_frames_goes_on_to_the_last_bit() -> None:
-    torch.set_num_threads(1)
     steps = golden("maze3d")
     steps = [replace(step, unlikeness=2.0 if 90 < k < 110 else 0.0) for k, step in enumerate(steps)]
     original = OnlineTrajectory.load(WEIGHTS / "maze3d", 200, "maze3d", 8, 1)
@@ -54,7 +51,6 @@ def test_a_session_with_unfamiliar_frames_goes_on_to_the_last_bit() -> None:
 
 def test_what_frames_told_before_they_were_known_to_be_unfamiliar_is_taken_back() -> None:
     """A mean over 16 frames tells: until then their loops and registrations were taken."""
-    torch.set_num_threads(1)
     steps = golden("maze2d")
     told = len(steps) // 8 * 8 - 8
     late = [replace(step, unlikeness=2.0 if k >= told else 0.0) for k, step in enumerate(steps)]
@@ -68,7 +64,6 @@ def test_what_frames_told_before_they_were_known_to_be_unfamiliar_is_taken_back(
 
 @pytest.mark.parametrize("world", WORLDS)
 def test_behind_a_blind_stretch_a_small_correction_gives_way_to_the_odometry(world: str) -> None:
-    torch.set_num_threads(1)
     steps = golden(world)
     half = len(steps) // 2
     unknown = np.diag([4.0, 4.0, 0.04])
@@ -84,7 +79,6 @@ def test_behind_a_blind_stretch_a_small_correction_gives_way_to_the_odometry(wor
 def test_no_update_goes_on_from_shrunk_corrections_even_where_the_window_has_left_the_blind_stretch(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    torch.set_num_threads(1)
     steps = golden("maze3d")
     unknown = np.diag([4.0, 4.0, 0.04])
     blind = [replace(s, unlikeness=2.0, covariance=unknown) if 80 <= k < 88 else s for k, s in enumerate(steps)]
@@ -111,7 +105,6 @@ def test_no_update_goes_on_from_shrunk_corrections_even_where_the_window_has_lef
 
 def test_place_codes_alone_close_no_loop_across_a_blind_stretch(tmp_path: Path) -> None:
     """Nothing limits the motion within it: each place that looks alike would do."""
-    torch.set_num_threads(1)
     steps = golden("maze2d")
     folder = shutil.copytree(WEIGHTS / "maze2d", tmp_path / "maze2d")
     described = json.loads((folder / "neural_graph_optimizer.json").read_text())

@@ -27,7 +27,6 @@ def stored(world: str) -> SensedDrive:
 
 @functools.cache
 def estimates(world: str, fault: str | None) -> list[LocalEstimate]:
-    torch.set_num_threads(1)
     drive = stored(world) if fault is None else faulted(stored(world), fault, BEGIN, 0)
     return estimates_of(LocalOdometry.load(WEIGHTS / world), drive)
 
