@@ -58,14 +58,16 @@ another odometry: the state that was saved is loaded, the robot is looked for in
 with `map_changes:=learn`. From {settings[most_scans]} key scans on, old ones leave the graph.
 
 - Error: root mean square distance of the drive's positions, from where the robot was found on. The whole map is laid
-  on the truth by one rigid motion, so that it grows with the map. By itself: this part of the drive is laid on the
-  truth. Alone: this part, laid likewise, where the drive makes a map of its own. A drive in which the robot was never
-  found has none: means and intervals are over the others.
+  on the truth by one rigid motion, so that it [grows with the map](notebook.md#a-year-in-one-building). By itself:
+  this part of the drive is laid on the truth. Alone: this part, laid likewise, where the drive makes a map of its own.
+  A drive in which the robot was never found has none: means and intervals are over the others.
 - IoU: of the cells of `/map` with those that exact rays from the true poses of its scans see in the building as it is
   at the end of the drive, with each door as it was at the scan. Cells have 5 cm: of the thin lines of occupied ones
   noise alone makes many differ. Where all scans count alike, older ones are not bounded.
 - Localised: from {settings[starts]} starts in a drive, if the map shows the way there: a pose within 0.5 m and 5
-  degrees is claimed within 50 scans, or 300. False claims: wrong ones there, and where the drive itself was found.
+  degrees is claimed within 50 scans, or 300. A robot that begins a drive goes half as far in 50 scans as one that
+  drives ([why more are not found](notebook.md#a-robot-in-a-saved-map)). False claims: wrong ones there, and where the
+  drive itself was found.
 - Time a scan: computing time of odometry and correction; that of the map, drawn every 5 s, comes on top. Memory: all
   arrays of the saved state and of the map's scans."""
 
