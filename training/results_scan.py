@@ -52,6 +52,7 @@ _PAIRED = ("ate_m", "within_three_deviations", "negative_log_likelihood")
 _SLIPS_PER_KM = 300.0  # of the table of slip; the buildings have up to 60
 _ABLATED = ("buildings", "aliased")
 _WITH_WHEELS = ("logs", "buildings", "aliased", "slip")
+_FED = "percent_wrong"
 _SLIP_ROWS = ("wheels", "ours")
 _SETTINGS = ("buildings", "first_building", "ablation", "length_m", "mazes", "frames")
 _PUBLISHED: dict[str, dict[str, dict[str, float]]] = {
@@ -127,8 +128,10 @@ def _keep_published(result: dict[str, Any], published: Mapping[str, Any]) -> Non
     for name in ("logs", *result["tables"]):
         new, old = (result, published) if name == "logs" else (result["tables"], published.get("tables", {}))
         measured, known = list(new[name]), old.get(name, {}) if name == "logs" else _known(old.get(name, {}))
+        if any(row.endswith(_FED) for row in measured):  # these are compared with each other
+            known = {row: cell for row, cell in known.items() if not row.endswith(_FED)}
         if known.keys() - measured and not (name == "logs" and measured):
-            new[name] = {**known, **new[name]}
+            new[name] = known if name == "logs" else _known({**known, **new[name]})
             result["paired"][name] = {**_known(published["paired"].get(name, {})), **result["paired"][name]}
             of = {"revision": published["revision"], "settings": published["settings"]}
             result["earlier"][name] = {**published.get("earlier", {}).get(name, of), "measured": measured}
@@ -139,7 +142,7 @@ def _keep_published(result: dict[str, Any], published: Mapping[str, Any]) -> Non
 
 
 def _known(rows: Mapping[str, Any]) -> dict[str, Any]:
-    return {row: cell for row, cell in rows.items() if row in ROWS}
+    return {row: rows[row] for row in ROWS if row in rows}
 
 
 def _rows(names: Sequence[str]) -> tuple[dict[str, Row], list[str]]:
@@ -250,9 +253,9 @@ def _compared(key: str, both: np.ndarray) -> dict[str, Any]:
 
 def _paired_with(row: str) -> str:
     """Our row that another one is compared with: a peer's with as many wrong loops, ours with none."""
-    if row.startswith("ours_") and row.endswith("percent_wrong"):
+    if row.startswith("ours_") and row.endswith(_FED):
         return "ours_0_percent_wrong"
-    if row.endswith("percent_wrong"):
+    if row.endswith(_FED):
         return "_".join(("ours", *row.split("_")[-3:]))
     return "ours"
 

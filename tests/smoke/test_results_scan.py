@@ -81,6 +81,18 @@ def test_results_of_two_tiny_buildings(tmp_path: Path, monkeypatch: pytest.Monke
     assert shifted["tables"]["aliased"]["ours"]["ate_m"]["drives"] == 1
 
 
+def test_rows_that_are_not_measured_anew_stay_but_for_those_with_wrong_loops() -> None:
+    """Rows with wrong loops are compared with each other, so that all of them are of one revision."""
+    old = {"revision": "1", "settings": {"ablation": 5}, "logs": {"aces": {"ours": {}}}, "failed": []}
+    old |= {"tables": {"buildings": {"ours": {"ate_m": 1}, "ours_10_percent_wrong": {}}}, "paired": {}}
+    result = {"logs": {}, "tables": {"buildings": {"ours_60_percent_wrong": {}, "wheels": {}}}, "failed": []}
+    result["paired"] = {"logs": {}, "buildings": {}}
+    results_scan._keep_published(result, old)
+    assert list(result["tables"]["buildings"]) == ["wheels", "ours", "ours_60_percent_wrong"]
+    assert result["earlier"]["buildings"]["measured"] == ["ours_60_percent_wrong", "wheels"]
+    assert result["logs"] == old["logs"]
+
+
 @pytest.mark.parametrize("world", [("--world", "scan"), ("--world=scan",)])
 def test_the_command_of_results_takes_the_lidar(
     world: tuple[str, ...], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]

@@ -29,12 +29,15 @@ def draw(folder: Path, logs: Drives, tables: Mapping[str, Drives], earlier: Coll
     for table, count in _DRAWN.items():
         first = list(_drawable(tables.get(table, {})).items())[:count]
         pictures[table] = dict(first), f"the first drives of the table `{table}`, truth in black"
+    if "logs" in earlier:
+        kept = (path.stem.removeprefix("results_scan_") for path in sorted(folder.glob("results_scan_log_*.png")))
+        pictures = {name: ({}, name.removeprefix("log_")) for name in kept} | pictures
     images: dict[str, str] = {}
     for name, (drives, what) in pictures.items():
         path = folder / f"results_scan_{name}.png"
         if drives:
             _draw(path, drives)
-        if drives or (name in earlier and path.is_file()):
+        if drives or ((name in earlier or name.startswith("log_")) and path.is_file()):
             images[f"results_scan_{name}.png"] = f"{_COLOURS}: {what}."
     return images
 

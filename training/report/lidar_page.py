@@ -76,13 +76,13 @@ def page(result: Mapping[str, Any], images: Mapping[str, str]) -> str:
 def _earlier(tables: Mapping[str, Any]) -> list[str]:
     names = []
     for name, of in tables.items():
-        anew = ", ".join(map(_title, of["measured"]))
+        anew = ", ".join(_title(row).replace("*", "") for row in of["measured"])
         names.append(f"{name} (`{of['revision']}`{f'; anew: {anew}' if anew else ''})")
     return [f"**Not measured anew, and so of an earlier revision: {', '.join(names)}.**"] if names else []
 
 
 def _changed(result: Mapping[str, Any]) -> list[str]:
-    parts, drives = list[str](), f"The first {result['settings']['ablation']} drives of each table"
+    parts = list[str]()
     if slip := result["tables"]["slip"]:
         parts += [
             "## Wheels that slip",
@@ -90,14 +90,17 @@ def _changed(result: Mapping[str, Any]) -> list[str]:
             _table(slip, _BUILDING_COLUMNS),
         ]
     tables = {**result["logs"], **{name: result["tables"][name] for name in _BUILDING_TITLES}}
-    fed = {name: rows for name, rows in tables.items() if any(row in _FED for row in rows)}
+    fed = {name: {row: rows[row] for row in _FED if row in rows} for name, rows in tables.items()}
+    fed = {name: rows for name, rows in fed.items() if rows}
     if fed:
         parts += [
             "## Wrong loops fed in",
-            f"{drives}, and all logs. Errors (m: ATE; of a log with relations the mean of these) where so many of all "
-            "loops are wrong, all at once, from odometry. A wrong loop is a right one that took another place; five in "
-            "a row agree with each other. Each number is the mean over three draws.",
-            _across({name: {row: rows[row] for row in _FED if row in rows} for name, rows in fed.items()}, *_ERRORS),
+            "The first drives of each table, and all logs. Errors (m: ATE; of a log with relations the mean of these) "
+            "where so many of all loops are wrong, all at once, from odometry. A wrong loop is a right one that took "
+            "another place; five in a row agree with each other. Each number is the mean over three draws. Where the "
+            "robot got lost, nobody measured the step: a stretch that no right loop reaches then goes "
+            "where wrong ones put it.",
+            _across({_counted(name, rows): rows for name, rows in fed.items()}, *_ERRORS),
         ]
     for name in _BUILDING_TITLES:
         paired = result["paired"][name]
@@ -153,9 +156,16 @@ def _across(logs: Mapping[str, Any], *keys: str) -> str:
     def found(numbers: Mapping[str, Any]) -> str:
         return next((_cell(numbers, key) for key in keys if key in numbers), "")
 
-    rows = list(dict.fromkeys(row for numbers in logs.values() for row in numbers if found(numbers[row])))
+    there = dict.fromkeys(row for numbers in logs.values() for row in numbers if found(numbers[row]))
+    rows = sorted(there, key=lambda row: [*ROWS, row].index(row))
     body = [[_title(row), *(found(logs[log].get(row, {})) for log in logs)] for row in rows]
     return markdown(["", *logs], body)
+
+
+def _counted(name: str, rows: Mapping[str, Any]) -> str:
+    """A table's name with the number of its drives; a log's alone."""
+    count = max((number.get("drives", 0) for numbers in rows.values() for number in numbers.values()), default=0)
+    return f"{name}, {count} drives" if count else name
 
 
 def _title(row: str) -> str:
