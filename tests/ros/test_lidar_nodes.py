@@ -10,6 +10,7 @@ from geometry_msgs.msg import PoseWithCovarianceStamped, Quaternion, TransformSt
 from nav_msgs.msg import Odometry
 from ngo_msgs.msg import RelativePose
 from ngo_msgs.srv import Reset
+from rclpy.qos import QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import Imu, LaserScan
 from tf2_msgs.msg import TFMessage
 
@@ -25,7 +26,7 @@ from ngo_recordings.mounting import mounting_in
 from ngo_recordings.transform_buffer import TransformBuffer
 from tests.unit.ngo_estimator.ray_casting import ROOM, cast
 
-from .processes import LATCHED, NodeProcess, Probe
+from .processes import LATCHED, Diagnostics, NodeProcess, Probe
 from .readings import xyyaw
 
 pytestmark = pytest.mark.processes
@@ -276,3 +277,19 @@ def test_a_scanner_without_a_mounting_is_told_and_one_that_comes_late_counts(pro
             scans.publish(scan_message(drive()[step], BEGIN_NS + step * STEP_NS, False, noise))
         probe.spin_until(lambda: len(relative_poses) == 30, "a motion from the first scan with the mounting")
     assert to_ns(relative_poses[-1].origin_stamp) == BEGIN_NS + 30 * STEP_NS
+
+
+def test_odometry_that_is_published_best_effort_is_heard(probe: Probe) -> None:
+    """As robots publish it that take it for a sensor."""
+    best_effort = QoSProfile(depth=10, reliability=ReliabilityPolicy.BEST_EFFORT)
+    wheels = probe.node.create_publisher(Odometry, "wheels", best_effort)
+    diagnostics, odometry = Diagnostics(probe), Odometry()
+    odometry.pose.pose.orientation.w = 1.0
+    settings = {"world": "scan", "robot_odometry": "topic", "robot_odometry_topic": "wheels"}
+    with NodeProcess("ngo_estimator", "local_node", settings) as local:
+        local.wait_for_log("ready: /local_node, scan")
+        probe.meet("local_node")
+        for step in range(10):
+            odometry.header.stamp = to_time(BEGIN_NS + step * STEP_NS)
+            wheels.publish(odometry)
+        diagnostics.wait_for_value("/local_node", "robot odometry", lambda value: value == "heard")

@@ -56,6 +56,27 @@ def static(parent: str, child: str, *pose: float, **turn: float) -> Any:
     return m.transform(0, parent, child, m.pose(*pose, **turn))
 
 
+@pytest.mark.parametrize("kind", ["PoseStamped", "PoseWithCovarianceStamped", "TwistStamped"])
+def test_odometry_of_another_type_counts_where_it_is_named(tmp_path: Path, kind: str) -> None:
+    def wheels(k: int) -> Any:
+        pose = m.pose(0.1 * k, 0.0, 0.0)
+        inside = {
+            "PoseStamped": pose,
+            "PoseWithCovarianceStamped": m.make("geometry_msgs/msg/PoseWithCovariance", pose, np.zeros(36)),
+            "TwistStamped": m.twist(1.0, 0.0, 0.0),
+        }
+        return m.make(f"geometry_msgs/msg/{kind}", m.header(stamp(k), "odom"), inside[kind])
+
+    entries = [("/scan", stamp(k), scan(stamp(k))) for k in range(9)]
+    entries += [("/encoders", stamp(k), wheels(k)) for k in range(9)]
+    with open_recording([m.write_mcap(tmp_path / "a.mcap", entries)]) as recording:
+        (note,) = describe_lidar(recording, choose_topics(recording)).notes
+        assert "if it is /encoders (10.0 Hz), --wheels names it" in note
+        topics = choose_topics(recording, TopicArguments(wheels="/encoders"))
+        poses = [each.pose_xyyaw for each in scan_stream(recording, topics) if isinstance(each, WheelPose)]
+    np.testing.assert_allclose(poses, [(0.1 * k, 0.0, 0.0) for k in range(9)], atol=1e-12)
+
+
 def test_odometry_with_velocities_alone_is_summed_up(tmp_path: Path) -> None:
     entries: list[m.Entry] = []
     for k in range(60):

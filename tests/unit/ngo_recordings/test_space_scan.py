@@ -12,7 +12,7 @@ from ngo_recordings.laser_scan import LidarScan
 from ngo_recordings.lidar_description import describe_lidar
 from ngo_recordings.recording import open_recording
 from ngo_recordings.scan_stream import WheelPose, scan_stream
-from ngo_recordings.space_scan import cloud_scan, depth_scan
+from ngo_recordings.space_scan import DistanceUnit, cloud_scan, depth_scan
 from ngo_recordings.topics import TopicArguments, choose_topics
 from tests.unit.ngo_recordings import messages as m
 from tests.unit.ngo_recordings.test_scan_stream import odometry, static
@@ -174,6 +174,16 @@ def test_a_camera_is_described_whatever_its_images_show_of_it(change: str) -> No
 def test_clouds_in_millimetres_are_taken_so(kind: str) -> None:
     made = cloud_scan(m.cloud(BEGIN_NS, fields(1000.0 * turning()[0], kind)), "/points")
     assert np.isfinite(made.ranges).sum() > 1300 and off_walls(made).max() < 0.02 and "in millimetres" in made.note
+
+
+@pytest.mark.parametrize(("usual", "once"), [(1000.0, 50.0), (1.0, 250.0)])
+def test_the_unit_is_that_of_the_topic_and_not_of_each_message(usual: float, once: float) -> None:
+    """A wall at a few centimetres, or a field, among clouds of a room in millimetres or metres."""
+    unit, room = DistanceUnit(), turning()[0]
+    clouds = [m.cloud(BEGIN_NS, fields(scale * room)) for scale in (usual, usual, once, usual, *[1000.0 / usual] * 12)]
+    scans = [cloud_scan(each, "/points", unit) for each in clouds]
+    assert [bool(scan.note) for scan in scans] == [usual > 1.0] * 13 + [usual == 1.0] * 3
+    assert off_walls(scans[3]).max() < 0.02 and off_walls(scans[-1]).max() < 0.02
 
 
 @pytest.mark.parametrize("frame", ["robot1/base_link", "lidar"])

@@ -13,7 +13,7 @@ from ngo_recordings.laser_scan import LidarScan, ScanAngles, scan_angles
 from ngo_recordings.mounting import Mounting, find_mounting
 from ngo_recordings.recording import Recording
 from ngo_recordings.space_scan import scan_reader
-from ngo_recordings.topics import RecordingTopics, WheelSource, wheel_candidates
+from ngo_recordings.topics import WHEEL_TYPES, RecordingTopics, WheelSource, wheel_candidates
 
 _LOOK = 200
 
@@ -107,6 +107,11 @@ def _others(recording: Recording, topics: RecordingTopics, mounting: Mounting | 
                 f"two scanners have the frame {mounting.scan_frame}, and it has two places: robots whose frames have "
                 "the same names cannot be told apart, give each a prefix"
             )
+    if not wheels and topics.wheels is None:
+        truth = topics.ground_truth.topic if topics.ground_truth is not None else None
+        named = [name for name, info in recording.topics.items() if info.type_name in WHEEL_TYPES and info.count]
+        if named := [_with_rate(recording, name) for name in named if name != truth]:
+            notes.append(f"no odometry is used; if it is {' or '.join(named)}, --wheels names it")
     if len(wheels) > 1:
         taken = "no odometry" if topics.wheels is None else str(topics.wheels)
         there = ", ".join(_with_rate(recording, name) for name in wheels)

@@ -1,4 +1,4 @@
-"""Poses of nav_msgs/Odometry, also of robots that fill in the velocity alone."""
+"""Poses of odometry: of nav_msgs/Odometry, also where it has the velocity alone, of poses, and of velocities."""
 
 from __future__ import annotations
 
@@ -34,13 +34,15 @@ class OdometryPoses:
         Raises RecordingError for a message without a stamp.
         """
         stamp_ns = header_stamp_ns(message)
-        linear, angular = message.twist.twist.linear, message.twist.twist.angular
-        twist = np.array([linear.x, linear.y, angular.z])
-        given = planar_pose(message.pose.pose.position, message.pose.pose.orientation)
-        if np.isfinite(twist).all():
-            self._sum_up(stamp_ns, twist)
-            self._judge(given)
-        return self._pose.copy() if self.from_velocity else given
+        pose, twist = getattr(message, "pose", None), getattr(message, "twist", None)
+        pose, twist = getattr(pose, "pose", pose), getattr(twist, "twist", twist)  # with their covariance or without
+        given = None if pose is None else planar_pose(pose.position, pose.orientation)
+        if twist is not None:
+            velocity = np.array([twist.linear.x, twist.linear.y, twist.angular.z])
+            if np.isfinite(velocity).all():
+                self._sum_up(stamp_ns, velocity)
+                self._judge(given)
+        return self._pose.copy() if self.from_velocity or pose is None else given
 
     def _judge(self, given: np.ndarray | None) -> None:
         if self._first is None:

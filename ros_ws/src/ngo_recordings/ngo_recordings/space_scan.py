@@ -40,6 +40,8 @@ _FAR, _NEARLY_ALL = 200.0, 0.1
 """No sensor of a robot sees all but this share of its points so far away (m)."""
 _FEWEST, _ALIKE = 20, 0.999
 """Fewer tell no unit, and those within this of the farthest one say that nothing came back."""
+_AGAIN = 10
+"""So many messages in a row that say another unit are right."""
 _IN_MM = "its distances are in millimetres: taken so"
 _SAME_VIEW = 0.03
 """Widths and heights of two images of one view have the same ratio, but for pixels that were rounded off."""
@@ -56,8 +58,30 @@ def is_optical(frame: str) -> bool:
     return frame.endswith(("_optical_frame", "_optical"))
 
 
-def cloud_scan(message: Any, topic: str) -> LidarScan:
+class DistanceUnit:
+    """The unit of the distances on a topic: a driver may give them in millimetres. The first message that tells says
+    it, not each anew."""
+
+    def __init__(self) -> None:
+        self._unit_m: float | None = None
+        self._others = 0
+
+    def metres(self, values: np.ndarray) -> float:
+        """The unit (m), where a message has these distances."""
+        seen = values[np.isfinite(values) & (values > 0.0)]
+        seen = seen[seen < _ALIKE * seen.max(initial=0.0)]
+        if len(seen) >= _FEWEST:
+            found_m = 0.001 if np.quantile(seen, _NEARLY_ALL) > _FAR else 1.0
+            self._others = 0 if found_m == self._unit_m else self._others + 1
+            if self._unit_m is None or self._others >= _AGAIN:
+                self._unit_m, self._others = found_m, 0
+        return self._unit_m or 1.0
+
+
+def cloud_scan(message: Any, topic: str, unit: DistanceUnit | None = None) -> LidarScan:
     """The scan in a PointCloud2 of any layout; each ray has the time of its points where these have one.
+
+    ``unit`` is that of its topic; without, the message alone says it.
 
     Raises:
         RecordingError: it has no x and y, no stamp, or data of another size than it says.
@@ -71,7 +95,8 @@ def cloud_scan(message: Any, topic: str) -> LidarScan:
         raise RecordingError(f"a cloud of {topic} has the fields {', '.join(names) or 'none'}; expected x, y and z")
     flat = np.zeros(len(values))  # a lidar of one plane may leave z out
     points = np.stack([values[name].astype(np.float64) if name in names else flat for name in "xyz"], axis=-1)
-    unit_m, frame = _unit_m(np.linalg.norm(points, axis=1)), str(message.header.frame_id).strip("/")
+    unit_m = (unit or DistanceUnit()).metres(np.linalg.norm(points, axis=1))
+    frame = str(message.header.frame_id).strip("/")
     points *= unit_m
     notes = [_IN_MM] if unit_m != 1.0 else []
     if is_optical(frame):
@@ -88,8 +113,8 @@ def cloud_scan(message: Any, topic: str) -> LidarScan:
     return replace(_scan(points, offsets_s, _FARTHEST_M, stamp_ns, frame, topic), note="; ".join(notes))
 
 
-def depth_scan(message: Any, info: Any, topic: str) -> LidarScan:
-    """The scan in a depth Image, whose camera a CameraInfo describes.
+def depth_scan(message: Any, info: Any, topic: str, unit: DistanceUnit | None = None) -> LidarScan:
+    """The scan in a depth Image, whose camera a CameraInfo describes; ``unit`` as for `cloud_scan`.
 
     Raises:
         RecordingError: it is no depth image, has no stamp, or the CameraInfo is not of such a camera.
@@ -106,7 +131,7 @@ def depth_scan(message: Any, info: Any, topic: str) -> LidarScan:
             f"an image of {topic} is {width} x {height}; its CameraInfo is of {info.width} x {info.height}, its focal "
             f"length {focal}"
         )
-    unit_m = _unit_m(depth)
+    unit_m = (unit or DistanceUnit()).metres(depth)
     ahead = unit_m * depth[..., 0].astype(np.float64)
     ahead[~(ahead < _FARTHEST_DEPTH_M)] = np.nan
     left = (matrix[2] - np.arange(width)) / matrix[0] * ahead
@@ -163,10 +188,10 @@ def scan_reader(recording: Recording, topic: str, angle_increment: float | None 
     if type_name == SCAN_TYPE:
         return partial(scan_of, topic=topic, angle_increment=angle_increment)
     if type_name == CLOUD_TYPE:
-        return partial(cloud_scan, topic=topic)
+        return partial(cloud_scan, topic=topic, unit=DistanceUnit())
     if type_name == IMAGE_TYPE and info in recording.topics and recording.topics[info].count:
         ready = (each.value for each in recording.messages([info]) if camera_matrix(each.value).size)
-        return partial(depth_scan, info=next(ready, recording.first(info).value), topic=topic)
+        return partial(depth_scan, info=next(ready, recording.first(info).value), topic=topic, unit=DistanceUnit())
     raise RecordingError(
         f"topic {topic} is {type_name}; expected {SCAN_TYPE}, {CLOUD_TYPE}, or depth with a CameraInfo on {info}"
     )
@@ -192,13 +217,6 @@ def _records(message: Any, topic: str) -> np.ndarray:
         raise RecordingError(f"a cloud of {topic} has the fields {', '.join(names)}; expected each name once")
     kind = np.dtype({"names": names, "formats": formats, "offsets": [f.offset for f in known], "itemsize": step})
     return np.ndarray((height, width), kind, data, 0, (row, step)).reshape(-1)
-
-
-def _unit_m(values: np.ndarray) -> float:
-    """The unit of distances, m: a driver may give them in millimetres."""
-    seen = values[np.isfinite(values) & (values > 0.0)]
-    seen = seen[seen < _ALIKE * seen.max(initial=0.0)]
-    return 0.001 if len(seen) >= _FEWEST and np.quantile(seen, _NEARLY_ALL) > _FAR else 1.0
 
 
 def _sane(values: np.ndarray) -> float:

@@ -20,6 +20,7 @@ ACTION_TYPE = "ngo_msgs/msg/DiscreteAction"
 ODOMETRY_TYPE = "nav_msgs/msg/Odometry"
 TWIST_TYPES = ("geometry_msgs/msg/TwistStamped", "geometry_msgs/msg/Twist", ODOMETRY_TYPE)
 POSE_TYPES = (ODOMETRY_TYPE, "geometry_msgs/msg/PoseStamped", "geometry_msgs/msg/PoseWithCovarianceStamped")
+WHEEL_TYPES = (*POSE_TYPES, TWIST_TYPES[0])  # of which Odometry alone is taken without being named
 TF_TYPE = "tf2_msgs/msg/TFMessage"
 IMU_TYPE = "sensor_msgs/msg/Imu"
 
@@ -118,7 +119,7 @@ class TopicArguments:
     scan_topics: tuple[str, ...] = ()
     """Topics of several scanners, whose scans are put together; the first one is the image."""
     wheels: str | None = None
-    """Wheel odometry: a topic of Odometry, or tf:PARENT:CHILD; chosen for scans alone."""
+    """Wheel odometry: a topic of Odometry, poses or TwistStamped, or tf:PARENT:CHILD; chosen for scans alone."""
     imu: str | None = None
     """Topic of an Imu, whose yaw rate stands in for the wheels' turns where it agrees better with the scans."""
 
@@ -333,7 +334,7 @@ def _choose_wheels(
     if given is not None:
         wheels = WheelSource.parse(given)
         if wheels.topic is not None:
-            wheels = WheelSource(_given(recording, "wheels", wheels.topic, (ODOMETRY_TYPE,)))
+            wheels = WheelSource(_given(recording, "wheels", wheels.topic, WHEEL_TYPES))
         elif not _filled(recording, (TF_TYPE,)):
             raise RecordingError(f"wheel odometry is {wheels}, and no topic holds transforms ({TF_TYPE})")
         if truth is not None and str(wheels) == str(truth):

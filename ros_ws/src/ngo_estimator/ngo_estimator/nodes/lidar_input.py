@@ -1,7 +1,7 @@
 """The input of ``local_node`` with a lidar: scans, the robot's own odometry, and where the scanner sits."""
 
 import math
-from collections import deque
+from collections import defaultdict, deque
 from collections.abc import Callable
 from functools import partial
 from typing import Any
@@ -28,7 +28,7 @@ from ngo_recordings.imu import up_axis, up_direction, yaw_rate
 from ngo_recordings.laser_scan import LidarScan, scan_of
 from ngo_recordings.mounting import Mounting as KnownMounting
 from ngo_recordings.mounting import mounting_in
-from ngo_recordings.space_scan import camera_matrix, cloud_scan, depth_scan, info_topic
+from ngo_recordings.space_scan import DistanceUnit, camera_matrix, cloud_scan, depth_scan, info_topic
 
 _TYPES = {"LaserScan": LaserScan, "PointCloud2": PointCloud2, "depth": Image}
 _MOUNTING_WAIT_NS = 2_000_000_000
@@ -55,6 +55,7 @@ class LidarInput:
         self._on_tf = OdometryOnTf(self._robot.transforms, self._robot.odom_frame, self._robot.base_frame)
         self._said = ""
         self._infos: dict[str, CameraInfo] = {}
+        self._units: defaultdict[str, DistanceUnit] = defaultdict(DistanceUnit)
         self._held: deque[LidarScan] = deque(maxlen=_MOST_HELD)
         self._mountings: dict[str, KnownMounting | None] = {}  # by frame; None: taken to be the base frame
         self._topics = settings.scan_topics or (settings.scan_topic,)
@@ -101,9 +102,9 @@ class LidarInput:
     def _on_scan(self, topic: str, message: LaserScan | PointCloud2 | Image) -> None:
         try:
             if isinstance(message, PointCloud2):
-                scan = cloud_scan(message, topic)
+                scan = cloud_scan(message, topic, self._units[topic])
             elif isinstance(message, Image):
-                scan = depth_scan(message, self._infos.get(topic), topic)
+                scan = depth_scan(message, self._infos.get(topic), topic, self._units[topic])
             else:
                 scan = scan_of(message, topic)
         except ValueError as error:

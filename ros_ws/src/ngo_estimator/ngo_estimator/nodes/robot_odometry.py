@@ -5,7 +5,7 @@ from collections.abc import Callable
 import numpy as np
 from nav_msgs.msg import Odometry
 from rclpy.node import Node
-from rclpy.qos import DurabilityPolicy, QoSProfile
+from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from tf2_msgs.msg import TFMessage
 
 from ngo_estimator.nodes import messages
@@ -57,7 +57,8 @@ class RobotOdometry:
         """Subscribe to odometry and transforms."""
         self._status, settings = status, self._settings
         if settings.robot_odometry == "topic":
-            listening.to(Odometry, settings.robot_odometry_topic, self._read, QoSProfile(depth=_DEPTH))
+            poses = QoSProfile(depth=_DEPTH, reliability=ReliabilityPolicy[settings.image_reliability.upper()])
+            listening.to(Odometry, settings.robot_odometry_topic, self._read, poses)
         # Every node on a robot publishes transforms: no single publisher is held on to.
         listening.to_all(TFMessage, settings.tf_topic, self._read_moving, QoSProfile(depth=_DEPTH))
         latched = QoSProfile(depth=_DEPTH, durability=DurabilityPolicy.TRANSIENT_LOCAL)

@@ -148,7 +148,7 @@ class LocalNodeSettings(EstimatorSettings):
     )
     image_reliability: str = setting(
         "best_effort",
-        "Reliability of image_topic or scan_topic; reliable: lost messages are sent again.",
+        "Reliability of image_topic, scan_topic and robot_odometry_topic; reliable: lost messages are sent again.",
         choices=("best_effort", "reliable"),
     )
     image_depth: int = setting(5, "Queue of image_topic or scan_topic.", minimum=1, maximum=10_000)
