@@ -21,25 +21,18 @@ _COARSEST = 32.0  # Times the cells that were asked for: a map that is still too
 
 @dataclass(frozen=True)
 class ScanMapConfig:
-    """Which scans a map is made of.
-
-    A scan is taken if the robot has moved by ``spacing_m`` or turned by ``spacing_deg`` since the last one. Of the
-    scans from one square of ``place_m`` and one sector of ``place_deg``, the map keeps the newest ``most_at_a_place``:
-    its cost grows with the area, not with the time. A scan is entered anew once the ends of its rays have moved by
-    ``moved_cells`` of a cell. Scans within ``epoch_s`` count alike; older ones count less where these saw something
-    else. At most ``most_waiting`` scans wait for their poses; then the oldest is given up.
-    """
+    """Which scans a map is made of. Its cost grows with the area, not with the time."""
 
     resolution_m: float = 0.05
     occupancy: OccupancyConfig = field(default_factory=OccupancyConfig)
-    spacing_m: float = 0.2
-    spacing_deg: float = 10.0
-    place_m: float = 0.5
-    place_deg: float = 30.0
-    most_at_a_place: int = 8
-    moved_cells: float = 0.25
-    epoch_s: float = 600.0
-    most_waiting: int = 5000
+    spacing_m: float = 0.2  # A scan is taken if the robot has moved by this since the last one, or turned by
+    spacing_deg: float = 10.0  # this.
+    place_m: float = 0.5  # A place is one square of this side, and one sector
+    place_deg: float = 30.0  # of this angle.
+    most_at_a_place: int = 8  # So many scans of a place are kept, the newest.
+    moved_cells: float = 0.25  # A scan is entered anew once the ends of its rays have moved by this share of a cell.
+    epoch_s: float = 600.0  # Scans within this count alike; older ones count less where these saw something else.
+    most_waiting: int = 5000  # So many scans wait for their poses at most; then the oldest is given up.
 
     def __post_init__(self) -> None:
         check_positive(self, "resolution_m spacing_m spacing_deg place_m place_deg moved_cells epoch_s")
