@@ -44,10 +44,10 @@ seen from where a way led then, by the leaves of all doors.
 The ratio is the geometric mean over the places where both rules came to 95 %; a mean path is over those where its own
 rule did, so that a rule which gives long places up has a short one. The tour on the known map is searched for
 (insertion, 2-opt, or-opt, large neighbourhoods); the shortest one may be a little shorter.
-IoU is the mean of free and occupied cells of the robot's own map beside those exact rays, a map of
-own poses aligned as for the ATE; at true poses it is that of
-the scans of the same path. Decisions are timed as
-processor time."""
+In buildings of this size a lidar that sees 12 m drifts by millimetres, with wheels or without: the ATE tells no rules
+apart. IoU is the mean of free and occupied cells of the robot's own map beside those exact rays, a map of own poses
+aligned as for the ATE; at true poses it is that of the scans of the same path. Decisions are timed as processor
+time."""
 _KINDS = {
     "mazes": "Mazes",
     "buildings": "Buildings",
