@@ -105,7 +105,7 @@ def main(arguments: Arguments) -> dict[str, Any]:
     result: dict[str, Any] = {
         **arguments.made("scan"),
         "settings": {name: getattr(arguments, name) for name in _SETTINGS},
-        "logs": {name: {**_log_numbers(scored), **_published(name)} for name, scored in logs.items()},
+        "logs": {name: {**_log_numbers(scored), **_published(name)} for name, scored in logs.items() if scored},
         "tables": {name: _table_numbers(table) for name, table in tables.items()},
         "paired": {name: _paired(table) for name, table in {"logs": logs, **tables}.items()},
         "skipped": skipped,
