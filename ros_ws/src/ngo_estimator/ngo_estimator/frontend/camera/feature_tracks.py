@@ -61,7 +61,8 @@ def _flow(before: Grey, now: Grey, pixels: Array, guess: Array, levels: int) -> 
     there, found, residual = cv2.calcOpticalFlowPyrLK(
         before, now, start, hint.copy(), None, None, _WINDOW, levels, _STOP, cv2.OPTFLOW_USE_INITIAL_FLOW
     )
-    return there.reshape(-1, 2), found.ravel() == 1, residual.ravel()
+    kept = found.ravel() == 1
+    return there.reshape(-1, 2), kept, np.where(kept, residual.ravel(), 0.0)  # OpenCV leaves it open of lost ones
 
 
 def corners(grey: Grey, most: int, apart_px: float, taken: Array) -> Array:
