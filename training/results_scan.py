@@ -121,10 +121,10 @@ def main(arguments: Arguments) -> dict[str, Any]:
 def _keep_published(result: dict[str, Any], published: Mapping[str, Any]) -> None:
     """Take over what is published and not measured anew, with its failures: the logs, and rows of tables.
 
-    ``earlier`` of the result names the revision and the settings of each table with such rows, and its rows that were
-    ``measured`` anew.
+    ``earlier`` of the result names the revision and the settings of each table with such rows, and under ``measured``
+    the revision of each of its rows that is of a later one.
     """
-    result["earlier"] = {}
+    result["earlier"], anew = {}, {name: list(result["tables"][name]) for name in result["tables"]}
     for name in ("logs", *result["tables"]):
         new, old = (result, published) if name == "logs" else (result["tables"], published.get("tables", {}))
         measured, known = list(new[name]), old.get(name, {}) if name == "logs" else _known(old.get(name, {}))
@@ -134,10 +134,13 @@ def _keep_published(result: dict[str, Any], published: Mapping[str, Any]) -> Non
             new[name] = known if name == "logs" else _known({**known, **new[name]})
             result["paired"][name] = {**_known(published["paired"].get(name, {})), **result["paired"][name]}
             of = {"revision": published["revision"], "settings": published["settings"]}
-            result["earlier"][name] = {**published.get("earlier", {}).get(name, of), "measured": measured}
+            before = published.get("earlier", {}).get(name, {**of, "measured": {}})
+            later = {**before["measured"], **dict.fromkeys(measured, result["revision"])}
+            later = {row: revision for row, revision in later.items() if row in new[name]}
+            result["earlier"][name] = {**before, "measured": later}
     for line in published.get("failed", ()):
         table, _, row = line.partition(":")[0].split(", ")
-        if row not in result["earlier"].get(table, {}).get("measured", (row,)):
+        if table in result["earlier"] and row not in anew.get(table, ()):
             result["failed"].append(line)
 
 

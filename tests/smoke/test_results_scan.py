@@ -75,7 +75,7 @@ def test_results_of_two_tiny_buildings(tmp_path: Path, monkeypatch: pytest.Monke
     assert shifted["settings"]["first_building"] == 1
     assert shifted["tables"]["buildings"] == known["tables"]["buildings"]  # what is published stays, and says so
     of = {"revision": known["revision"], "settings": known["settings"]}
-    assert shifted["earlier"]["buildings"] == {**of, "measured": []}
+    assert shifted["earlier"]["buildings"] == {**of, "measured": {}}
     page = (tmp_path / "docs" / "results_scan.md").read_text()
     assert "of an earlier revision: buildings" in page and "results_scan_buildings.png" in page
     assert shifted["tables"]["aliased"]["ours"]["ate_m"]["drives"] == 1
@@ -86,10 +86,10 @@ def test_rows_that_are_not_measured_anew_stay_but_for_those_with_wrong_loops() -
     old = {"revision": "1", "settings": {"ablation": 5}, "logs": {"aces": {"ours": {}}}, "failed": []}
     old |= {"tables": {"buildings": {"ours": {"ate_m": 1}, "ours_10_percent_wrong": {}}}, "paired": {}}
     result = {"logs": {}, "tables": {"buildings": {"ours_60_percent_wrong": {}, "wheels": {}}}, "failed": []}
-    result["paired"] = {"logs": {}, "buildings": {}}
+    result |= {"revision": "2", "paired": {"logs": {}, "buildings": {}}}
     results_scan._keep_published(result, old)
     assert list(result["tables"]["buildings"]) == ["wheels", "ours", "ours_60_percent_wrong"]
-    assert result["earlier"]["buildings"]["measured"] == ["ours_60_percent_wrong", "wheels"]
+    assert result["earlier"]["buildings"]["measured"] == {"ours_60_percent_wrong": "2", "wheels": "2"}
     assert result["logs"] == old["logs"]
 
 

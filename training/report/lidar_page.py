@@ -76,8 +76,9 @@ def page(result: Mapping[str, Any], images: Mapping[str, str]) -> str:
 def _earlier(tables: Mapping[str, Any]) -> list[str]:
     names = []
     for name, of in tables.items():
-        anew = ", ".join(_title(row).replace("*", "") for row in of["measured"])
-        names.append(f"{name} (`{of['revision']}`{f'; anew: {anew}' if anew else ''})")
+        rows = of["measured"].items()
+        later = "".join(f"; {_title(row).replace('*', '')}: `{revision}`" for row, revision in rows)
+        names.append(f"{name} (`{of['revision']}`{later})")
     return [f"**Not measured anew, and so of an earlier revision: {', '.join(names)}.**"] if names else []
 
 
