@@ -96,11 +96,12 @@ def likeliest_mixture(squared: np.ndarray, logs: np.ndarray, degrees: np.ndarray
 def cycle_odds(chain: ChainUncertainty, loops: RelativePoses, area: float, inlier_ratio: float) -> np.ndarray:
     """Log odds ``(n,)`` of loops by their cycles with the chain and with each other, from their inlier ratio on."""
     squared, logs = chain.off_chain(loops)
-    # A chain that says no more than "on the map", as behind a step that nobody measured, speaks against no loop.
-    logs = np.minimum(logs, logs + 2.0 * likelihood_ratio(np.zeros(len(loops)), logs, loops.degrees, area))
+    whole = loops.degrees == 3
+    # A chain that says no more than "on the map", as behind a step that nobody measured, speaks against no whole pose.
+    least = likelihood_ratio(np.zeros(len(loops)), logs, loops.degrees, area)
+    logs[whole] += 2.0 * np.minimum(least[whole], 0.0)
     odds = likelihood_ratio(squared, logs, loops.degrees, area)
     odds += math.log(inlier_ratio / (1.0 - inlier_ratio))
-    whole = loops.degrees == 3
     for rows in (np.flatnonzero(whole), np.flatnonzero(~whole)):
         if len(rows) > 1:
             pairs = _nearest(loops.nodes[rows], _PARTNERS + 1)
