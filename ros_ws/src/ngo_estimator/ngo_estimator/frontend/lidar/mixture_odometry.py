@@ -130,8 +130,9 @@ class MixtureOdometry:
             pose, covariance = self.mixture.foretold(before, self._covariance)
             self.mixture.take(self.mixture.heaviest, before, pose, covariance, None)
             segment = silent or self._is_gone(pose, covariance)
-            if segment:  # at least as far away as it was looked for
-                covariance = covariance + np.diag((config.most_window_m**2, config.most_window_m**2, math.pi**2))
+            if segment:  # further away than it was looked for
+                metres = 2.0 * config.most_window_m
+                covariance = covariance + np.diag((metres**2, metres**2, math.pi**2))
                 self._submap.clear()
                 self._reckoned, self._doubt = np.zeros(2), np.zeros((3, 3))
             return self._accepted(scan, pose, covariance, True, segment)
