@@ -21,7 +21,7 @@ import tyro
 from ngo_common.files import written_whole
 from ngo_estimator.offline.lidar_check import lidar_lines
 from ngo_recordings.errors import RecordingError
-from ngo_recordings.images import CLOUD_TYPE, SCAN_TYPE
+from ngo_recordings.images import LIDAR_TYPES
 from ngo_recordings.recording import Recording, open_recording
 from ngo_recordings.topics import TopicArguments, choose_topics
 from training.recordings.recording_picture import save_picture
@@ -46,7 +46,7 @@ def main(arguments: Arguments) -> Report:
             print("\n".join(topic_table(recording)))
         topics = choose_topics(recording, arguments.topics)
         lidar: list[str] = []
-        if recording.topics[topics.image].type_name in (SCAN_TYPE, CLOUD_TYPE):
+        if recording.topics[topics.image].type_name in LIDAR_TYPES:
             if topics.action is None and arguments.topics.twist is None:  # a lidar takes no commanded velocities
                 topics = replace(topics, twist=None)
             lidar = lidar_lines(recording, topics)

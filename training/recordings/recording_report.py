@@ -14,7 +14,7 @@ from tqdm import tqdm
 
 from ngo_recordings.association import header_stamp_ns
 from ngo_recordings.frames import NO_DEPTH, UNUSABLE, Frame, frames
-from ngo_recordings.images import CLOUD_TYPE, SCAN_TYPE
+from ngo_recordings.images import LIDAR_TYPES
 from ngo_recordings.recording import Message, Recording
 from ngo_recordings.topics import POSE_TYPES, TF_TYPE, RecordingTopics, transform_topics
 
@@ -153,7 +153,7 @@ def topic_uses(recording: Recording, topics: RecordingTopics) -> dict[str, str]:
     use(topics.image, "image")
     for name in topics.more_scans:
         use(name, "scans of another scanner")
-    if recording.topics[topics.image].type_name in (SCAN_TYPE, CLOUD_TYPE):
+    if recording.topics[topics.image].type_name in LIDAR_TYPES:
         for name in transform_topics(recording, topics.image):
             use(name, "where the scanner sits")
     use(topics.depth, "depth channel")

@@ -158,6 +158,34 @@ def test_wheels_of_transforms(tmp_path: Path, chained: bool) -> None:
     np.testing.assert_allclose(poses, expected, atol=1e-9)
 
 
+@pytest.mark.parametrize("parent", ["odom_combined", "world", "base_footprint"])
+def test_odometry_on_tf_below_any_frame_counts_and_below_a_global_one_is_named(tmp_path: Path, parent: str) -> None:
+    entries: list[m.Entry] = [("/tf_static", stamp(0), m.transforms(static("base_link", "laser", 0.5, 0, 0)))]
+    for k in range(20):
+        moved = m.transform(stamp(k), parent, "base_link", m.pose(0.1 * k, 0.0, 0.0))
+        entries += [("/tf", stamp(k), m.transforms(moved)), ("/scan", stamp(k), scan(stamp(k)))]
+    with open_recording([m.write_mcap(tmp_path / "a.mcap", entries)]) as recording:
+        topics = choose_topics(recording)
+        (*_, note) = ("", *describe_lidar(recording, topics).notes)
+    assert str(topics.wheels) == ("tf:odom_combined:base_link" if parent == "odom_combined" else "None")
+    assert ("if it is tf:world:base_link, --wheels names it" in note) == (parent == "world")
+
+
+def test_of_several_echoes_the_first_counts(tmp_path: Path) -> None:
+    plain, echo = scan(stamp(1)), m.STORE.types["sensor_msgs/msg/LaserEcho"]
+    echoes = [echo(np.array([each, each + 1.0][: 1 + k % 2], np.float32)) for k, each in enumerate(plain.ranges)]
+    echoes[3] = echo(np.zeros(0, np.float32))
+    fields = {**vars(plain), "ranges": echoes, "intensities": []}
+    fields.pop("__msgtype__", None)
+    made = m.STORE.types["sensor_msgs/msg/MultiEchoLaserScan"](**fields)
+    with open_recording([m.write_mcap(tmp_path / "a.mcap", [("/echoes", stamp(1), made)])]) as recording:
+        topics = choose_topics(recording)
+        (found,) = scan_stream(recording, topics)
+        assert describe_lidar(recording, topics).rays == len(plain.ranges)
+    assert isinstance(found, LidarScan) and np.isnan(found.ranges[3])
+    np.testing.assert_array_equal(np.delete(found.ranges, 3), np.delete(plain.ranges, 3))
+
+
 def test_what_is_damaged_is_counted_or_named(tmp_path: Path) -> None:
     entries = drive(3)
     entries.append(("/odom", stamp(4), odometry(stamp(4), math.nan, 0, 0)))

@@ -15,6 +15,9 @@ IMAGE_TYPE = "sensor_msgs/msg/Image"
 COMPRESSED_TYPE = "sensor_msgs/msg/CompressedImage"
 SCAN_TYPE = "sensor_msgs/msg/LaserScan"
 CLOUD_TYPE = "sensor_msgs/msg/PointCloud2"
+MULTI_ECHO_TYPE = "sensor_msgs/msg/MultiEchoLaserScan"
+LIDAR_TYPES = (SCAN_TYPE, MULTI_ECHO_TYPE, CLOUD_TYPE)
+"""Of scans, the best one first."""
 SENSOR_TYPES = (IMAGE_TYPE, COMPRESSED_TYPE, SCAN_TYPE)
 """Of messages that networks take."""
 

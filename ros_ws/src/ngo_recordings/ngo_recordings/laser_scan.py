@@ -151,12 +151,17 @@ def _angles(count: int, low: float, high: float, increment: float, topic: str) -
 
 
 def scan_of(value: Any, topic: str, angle_increment: float | None = None) -> LidarScan:
-    """A LaserScan message as a record; its angles are those of `scan_angles`, the increment one's own where given.
+    """A LaserScan or MultiEchoLaserScan message as a record; of several echoes the first one counts.
+
+    Its angles are those of `scan_angles`, the increment one's own where given.
 
     Raises:
         RecordingError: the scan has no angles, or no stamp.
     """
     angles = scan_angles(value, topic)
+    ranges = value.ranges
+    if hasattr(ranges[0], "echoes"):
+        ranges = [next(iter(ray.echoes), math.nan) for ray in ranges]
     time_increment = float(value.time_increment)
     low, high = (0.0 if math.isnan(limit) else float(limit) for limit in (value.range_min, value.range_max))
     if low >= high > 0.0:  # between them is no range: neither is known
@@ -165,7 +170,7 @@ def scan_of(value: Any, topic: str, angle_increment: float | None = None) -> Lid
         header_stamp_ns(value),
         angles.angle_min,
         angles.angle_increment if angle_increment is None else angle_increment,
-        np.asarray(value.ranges, np.float32)[: angles.rays],
+        np.asarray(ranges, np.float32)[: angles.rays],
         low,
         high,
         time_increment if math.isfinite(time_increment) else 0.0,

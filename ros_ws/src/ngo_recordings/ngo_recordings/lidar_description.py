@@ -8,12 +8,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ngo_recordings.errors import RecordingError
-from ngo_recordings.images import CLOUD_TYPE, SCAN_TYPE
+from ngo_recordings.images import LIDAR_TYPES
 from ngo_recordings.laser_scan import LidarScan, ScanAngles, scan_angles
 from ngo_recordings.mounting import Mounting, find_mounting
 from ngo_recordings.recording import Recording
 from ngo_recordings.space_scan import scan_reader
-from ngo_recordings.topics import WHEEL_TYPES, RecordingTopics, WheelSource, wheel_candidates
+from ngo_recordings.topics import WHEEL_TYPES, RecordingTopics, WheelSource, wheel_candidates, wheel_transforms
 
 _LOOK = 200
 
@@ -83,7 +83,7 @@ def _first_scans(recording: Recording, topic: str) -> tuple[LidarScan, ScanAngle
             continue
         stamps.append(scan.stamp_ns)
         if first is None or angles is None:
-            of_laser = recording.topics[topic].type_name == SCAN_TYPE
+            of_laser = hasattr(message.value, "angle_min")
             angles = scan_angles(message.value, topic) if of_laser else ScanAngles(scan.angle_min, scan.angle_increment)
             first = scan
     if first is None or angles is None:
@@ -93,8 +93,7 @@ def _first_scans(recording: Recording, topic: str) -> tuple[LidarScan, ScanAngle
 
 def _others(recording: Recording, topics: RecordingTopics, mounting: Mounting | None) -> list[str]:
     """A sentence on other scans, and one on other odometries, each with its rate."""
-    kinds = (SCAN_TYPE, CLOUD_TYPE)
-    scans = [name for name, info in recording.topics.items() if info.type_name in kinds and info.count]
+    scans = [name for name, info in recording.topics.items() if info.type_name in LIDAR_TYPES and info.count]
     wheels = wheel_candidates(recording, topics.image, topics.ground_truth)
     notes = []
     if more := [name for name in scans if name not in topics.scans]:
@@ -110,8 +109,10 @@ def _others(recording: Recording, topics: RecordingTopics, mounting: Mounting | 
     if not wheels and topics.wheels is None:
         truth = topics.ground_truth.topic if topics.ground_truth is not None else None
         named = [name for name, info in recording.topics.items() if info.type_name in WHEEL_TYPES and info.count]
-        if named := [_with_rate(recording, name) for name in named if name != truth]:
-            notes.append(f"no odometry is used; if it is {' or '.join(named)}, --wheels names it")
+        sources = [_with_rate(recording, name) for name in named if name != truth]
+        sources += map(str, wheel_transforms(recording, topics.image, topics.ground_truth))
+        if sources:
+            notes.append(f"no odometry is used; if it is {' or '.join(sources)}, --wheels names it")
     if len(wheels) > 1:
         taken = "no odometry" if topics.wheels is None else str(topics.wheels)
         there = ", ".join(_with_rate(recording, name) for name in wheels)

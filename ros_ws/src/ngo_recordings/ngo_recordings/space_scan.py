@@ -15,7 +15,7 @@ import numpy as np
 
 from ngo_recordings.association import header_stamp_ns
 from ngo_recordings.errors import RecordingError
-from ngo_recordings.images import CLOUD_TYPE, IMAGE_TYPE, SCAN_TYPE, depth_picture
+from ngo_recordings.images import CLOUD_TYPE, IMAGE_TYPE, LIDAR_TYPES, MULTI_ECHO_TYPE, SCAN_TYPE, depth_picture
 from ngo_recordings.laser_scan import LidarScan, scan_of
 
 if TYPE_CHECKING:  # live nodes need no files
@@ -185,7 +185,7 @@ def scan_reader(recording: Recording, topic: str, angle_increment: float | None 
         RecordingError: they become no scans, or are depth without a CameraInfo.
     """
     type_name, info = recording.topics[topic].type_name, info_topic(topic)
-    if type_name == SCAN_TYPE:
+    if type_name in (SCAN_TYPE, MULTI_ECHO_TYPE):
         return partial(scan_of, topic=topic, angle_increment=angle_increment)
     if type_name == CLOUD_TYPE:
         return partial(cloud_scan, topic=topic, unit=DistanceUnit())
@@ -193,7 +193,7 @@ def scan_reader(recording: Recording, topic: str, angle_increment: float | None 
         ready = (each.value for each in recording.messages([info]) if camera_matrix(each.value).size)
         return partial(depth_scan, info=next(ready, recording.first(info).value), topic=topic, unit=DistanceUnit())
     raise RecordingError(
-        f"topic {topic} is {type_name}; expected {SCAN_TYPE}, {CLOUD_TYPE}, or depth with a CameraInfo on {info}"
+        f"topic {topic} is {type_name}; expected {', '.join(LIDAR_TYPES)}, or depth with a CameraInfo on {info}"
     )
 
 

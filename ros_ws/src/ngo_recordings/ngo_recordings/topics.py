@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from ngo_recordings.errors import RecordingError
-from ngo_recordings.images import CLOUD_TYPE, COMPRESSED_TYPE, DEPTH_ENCODINGS, IMAGE_TYPE, SCAN_TYPE, SENSOR_TYPES
+from ngo_recordings.images import COMPRESSED_TYPE, DEPTH_ENCODINGS, IMAGE_TYPE, LIDAR_TYPES, SENSOR_TYPES
 from ngo_recordings.transform_buffer import TransformBuffer, is_named
 
 if TYPE_CHECKING:  # live nodes need no files
@@ -25,7 +25,7 @@ TF_TYPE = "tf2_msgs/msg/TFMessage"
 IMU_TYPE = "sensor_msgs/msg/Imu"
 
 _NONE = "none"
-_SCANS = (SCAN_TYPE, CLOUD_TYPE, IMAGE_TYPE)  # of depth
+_SCANS = (*LIDAR_TYPES, IMAGE_TYPE)  # of depth
 _BASE_FRAMES = ("base_link", "base_footprint", "base")
 _ODOMETRY_FRAME = "odom"
 _GLOBAL_FRAMES = ("map", "world", "earth")
@@ -101,7 +101,8 @@ class TopicArguments:
     """What a person says about topics on the command line; a field that is not given is chosen, `none` uses nothing."""
 
     image: str | None = None
-    """Topic of the pictures or scans: Image, CompressedImage or LaserScan; for a lidar PointCloud2, and depth, too."""
+    """Topic of the pictures or scans: Image, CompressedImage or LaserScan; for a lidar MultiEchoLaserScan, PointCloud2,
+    and depth, too."""
     depth: str | None = None
     """Topic of a depth image (32FC1, 16UC1) that becomes one more channel of the pictures; none unless given."""
     action: str | None = None
@@ -131,9 +132,9 @@ class TopicArguments:
 class RecordingTopics:
     """What is used for what; None: nothing. `choose_topics` makes one that fits the recording.
 
-    image: Image, CompressedImage, LaserScan or PointCloud2. depth: Image of depth, one more channel. action:
-    DiscreteAction. twist: Twist, TwistStamped or Odometry. wheels, imu: wheel odometry and Imu, for `scan_stream`.
-    more_scans: those of other scanners. The times are those of TopicArguments.
+    image: Image, CompressedImage, LaserScan, MultiEchoLaserScan or PointCloud2. depth: Image of depth, one more
+    channel. action: DiscreteAction. twist: Twist, TwistStamped or Odometry. wheels, imu: wheel odometry and Imu, for
+    `scan_stream`. more_scans: those of other scanners. The times are those of TopicArguments.
     """
 
     image: str
@@ -165,8 +166,9 @@ def choose_topics(
     Not given, the image is the only colour or grey Image, else the only CompressedImage, else `choose_scan`; the action
     is a DiscreteAction that is no command; the twist, where there is no action, the only Twist or TwistStamped; the
     ground truth an Odometry or pose topic whose name says so. Where the image is of scans, or with_wheels, the wheels
-    are the first of `wheel_candidates`, if it is the only one or its name says so; where there is none, the transform
-    from odom to the robot. With wheels, the IMU is the first of this robot. Nothing else is guessed.
+    are the first of `wheel_candidates`, if it is the only one or its name says so; where there is none, the first of
+    `wheel_transforms` below a frame that is not global. With wheels, the IMU is the first of this robot. No more is
+    guessed.
 
     Raises:
         RecordingError: a topic that is given is not there, empty or of another type, or the image topic is not clear.
@@ -174,7 +176,7 @@ def choose_topics(
     given = given or TopicArguments()
     scans: list[str | None] = [_given(recording, "scans", name, _SCANS) for name in given.scan_topics]
     first, *more = scans or [given.image]
-    image = _given(recording, "image", first, (*SENSOR_TYPES, CLOUD_TYPE)) or _choose_image(recording)
+    image = _given(recording, "image", first, (IMAGE_TYPE, COMPRESSED_TYPE, *LIDAR_TYPES)) or _choose_image(recording)
     action = _given(recording, "action", given.action, (ACTION_TYPE,))
     if given.action is None:
         action = _only(name for name in _filled(recording, (ACTION_TYPE,)) if not name.endswith("command"))
@@ -208,12 +210,13 @@ def choose_topics(
 
 
 def choose_scan(recording: Recording) -> str | None:
-    """The topic of laser scans, else that of point clouds; of several the one called scan in the shortest namespace.
+    """The topic of laser scans, else of scans with echoes, else of point clouds; of several the one called scan
+    in the shortest namespace.
 
     None: there is none.
     """
     return min(
-        _filled(recording, (SCAN_TYPE,)) or _filled(recording, (CLOUD_TYPE,)),
+        next((names for kind in LIDAR_TYPES if (names := _filled(recording, (kind,)))), []),
         key=lambda name: (not name.endswith("/scan"), name.count("/"), -recording.topics[name].count, name),
         default=None,
     )
@@ -234,7 +237,7 @@ def wheel_candidates(recording: Recording, image: str, truth: GroundTruth | None
         if _TRUTH_NAMES.search(name) or (truth is not None and name == truth.topic):
             continue
         parent, child = _odometry_frames(recording, name)
-        if any(is_named(parent, each, frame) for each in _GLOBAL_FRAMES):
+        if _is_any(_GLOBAL_FRAMES, parent, frame):
             continue
         kind = next((k for k, names in enumerate(_WHEEL_NAMES) if names.search(name)), len(_WHEEL_NAMES))
         other = child.rpartition("/")[0] != prefix
@@ -244,6 +247,10 @@ def wheel_candidates(recording: Recording, image: str, truth: GroundTruth | None
         if chosen := [key for *told, key in found if tuple(told) == wanted]:
             return [name for *_, name in sorted(chosen)]
     return []
+
+
+def _is_any(names: Iterable[str], frame: str, beside: str) -> bool:
+    return any(is_named(frame, name, beside) for name in names)
 
 
 def _carries(tree: TransformBuffer, base: str, scan_frame: str) -> bool:
@@ -340,12 +347,14 @@ def _choose_wheels(
         if truth is not None and str(wheels) == str(truth):
             raise RecordingError(f"wheel odometry and ground truth are both {wheels}: name another, or {_NONE}")
         return wheels
-    if recording.topics[image].type_name not in (SCAN_TYPE, CLOUD_TYPE) and not scans:
+    if recording.topics[image].type_name not in LIDAR_TYPES and not scans:
         return None
     if candidates := wheel_candidates(recording, image, truth):
         clear = len(candidates) == 1 or any(names.search(candidates[0]) for names in _WHEEL_NAMES)
         return WheelSource(candidates[0]) if clear else None
-    return _choose_transform(recording, image, truth)
+    sources = wheel_transforms(recording, image, truth)
+    frame = _scan_frame(recording, image)
+    return next((each for each in sources if each.tf and not _is_any(_GLOBAL_FRAMES, each.tf[0], frame)), None)
 
 
 def _scan_frame(recording: Recording, image: str) -> str:
@@ -378,15 +387,22 @@ def _first_transforms(recording: Recording, image: str) -> tuple[TransformBuffer
     return tree, moving
 
 
-def _choose_transform(recording: Recording, image: str, truth: GroundTruth | None) -> WheelSource | None:
-    """The transform from odom to the robot in the first seconds: one that carries the scanner comes first."""
+def wheel_transforms(recording: Recording, image: str, truth: GroundTruth | None = None) -> list[WheelSource]:
+    """The transforms of the first seconds that may be odometry, the best one first: below odom those that carry the
+    scanner, and others to the robot; then those that carry it below any other frame, global ones last."""
     scan = _scan_frame(recording, image)
     tree, moving = _first_transforms(recording, image)
-    found = [frames for frames in moving if is_named(frames[0], _ODOMETRY_FRAME, scan)]
-    found = [frames for frames in found if truth is None or truth.tf != frames]
-    carrying = [frames for frames in found if frames[1] in tree.above(scan)]
-    named = [frames for frames in found if any(is_named(frames[1], base, scan) for base in _BASE_FRAMES)]
-    return next((WheelSource(tf=frames) for frames in (*carrying, *named)), None)
+    above, found = tree.above(scan), []
+    for frames in moving:
+        parent, child = frames
+        carries, robot = child in above, _is_any(_BASE_FRAMES, child, scan)
+        if truth is not None and truth.tf == frames:
+            continue
+        if is_named(parent, _ODOMETRY_FRAME, scan) and (carries or robot):
+            found.append((0 if carries else 1, WheelSource(tf=frames)))
+        elif carries and robot and not _is_any(_BASE_FRAMES, parent, scan):
+            found.append((3 if _is_any(_GLOBAL_FRAMES, parent, scan) else 2, WheelSource(tf=frames)))
+    return [source for _, source in sorted(found, key=lambda each: each[0])]
 
 
 def _frames(text: str, use: str, example: str) -> tuple[str, str]:

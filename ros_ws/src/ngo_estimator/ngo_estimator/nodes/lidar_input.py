@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from rclpy.node import Node
 from rclpy.qos import QoSProfile, ReliabilityPolicy
-from sensor_msgs.msg import CameraInfo, Image, Imu, LaserScan, PointCloud2
+from sensor_msgs.msg import CameraInfo, Image, Imu, LaserScan, MultiEchoLaserScan, PointCloud2
 
 from ngo_estimator.data.relative_step import RelativeStep
 from ngo_estimator.frontend.intake.lidar_intake import LidarIntake
@@ -30,7 +30,7 @@ from ngo_recordings.mounting import Mounting as KnownMounting
 from ngo_recordings.mounting import mounting_in
 from ngo_recordings.space_scan import DistanceUnit, camera_matrix, cloud_scan, depth_scan, info_topic
 
-_TYPES = {"LaserScan": LaserScan, "PointCloud2": PointCloud2, "depth": Image}
+_TYPES = {"LaserScan": LaserScan, "MultiEchoLaserScan": MultiEchoLaserScan, "PointCloud2": PointCloud2, "depth": Image}
 _MOUNTING_WAIT_NS = 2_000_000_000
 _MOST_HELD = 200
 _MOST_READINGS = 1000
@@ -99,7 +99,7 @@ class LidarInput:
         if topic not in self._infos or camera_matrix(message).size:
             self._infos[topic] = message
 
-    def _on_scan(self, topic: str, message: LaserScan | PointCloud2 | Image) -> None:
+    def _on_scan(self, topic: str, message: LaserScan | MultiEchoLaserScan | PointCloud2 | Image) -> None:
         try:
             if isinstance(message, PointCloud2):
                 scan = cloud_scan(message, topic, self._units[topic])

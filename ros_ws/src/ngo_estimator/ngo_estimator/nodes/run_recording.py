@@ -37,7 +37,7 @@ from ngo_estimator.offline.compiling import compiling
 from ngo_estimator.trajectory.errors import KITTI_LENGTHS_M, RelativeDelta
 from ngo_estimator.trajectory.report import ReportSettings, remarks, report_table
 from ngo_recordings.calibration import CAMERA_INFO_TYPE
-from ngo_recordings.images import CLOUD_TYPE, COMPRESSED_TYPE, IMAGE_TYPE, SCAN_TYPE
+from ngo_recordings.images import COMPRESSED_TYPE, IMAGE_TYPE, LIDAR_TYPES
 from ngo_recordings.recording import Recording, open_recording
 from ngo_recordings.topics import RecordingTopics, TopicArguments, choose_scan, choose_topics
 
@@ -112,7 +112,7 @@ class Arguments:
         if self.world is not None or self.weights is not None or self.topics.scan_topics:
             return self.world == CAMERA_WORLD
         filled = {info.type_name for info in recording.topics.values() if info.count}
-        pictures, scans = filled & {IMAGE_TYPE, COMPRESSED_TYPE}, filled & {SCAN_TYPE, CLOUD_TYPE}
+        pictures, scans = filled & {IMAGE_TYPE, COMPRESSED_TYPE}, filled.intersection(LIDAR_TYPES)
         return bool(pictures) and not scans and CAMERA_INFO_TYPE in filled
 
     def weights_folder(self, recording: Recording) -> Path:

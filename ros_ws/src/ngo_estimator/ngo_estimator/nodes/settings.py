@@ -113,9 +113,9 @@ class LocalNodeSettings(EstimatorSettings):
     )
     scan_type: str = setting(
         "LaserScan",
-        "Type of the scans of a lidar: LaserScan; PointCloud2, of which the sensor's own height counts; or depth: an "
-        "Image, with its CameraInfo on camera_info beside it.",
-        choices=("LaserScan", "PointCloud2", "depth"),
+        "Type of the scans of a lidar: LaserScan; MultiEchoLaserScan, of which first echoes count; PointCloud2, of "
+        "which the sensor's own height counts; or depth: an Image, with its CameraInfo on camera_info beside it.",
+        choices=("LaserScan", "MultiEchoLaserScan", "PointCloud2", "depth"),
     )
     min_range: float = setting(
         0.0,
