@@ -146,6 +146,20 @@ def test_wheels_of_another_scale_are_scaled(way: float, turn: float, said: list[
     assert all(each in line for each, line in zip(said, run.remarks(), strict=False))
 
 
+def test_wheels_that_no_robot_drives_so_fast_are_left_out_until_their_scale_is_known() -> None:
+    """By another clock such wheels say that the robot stands, and ways by scans that believe it tell no scale."""
+    poses, clock, noise, useless = drive(600), WheelClock(), np.random.default_rng(3), []
+    wheels = np.array([between(poses[0], pose) * (1000.0, 1000.0, 1.0) for pose in poses])
+    for k, (pose, following) in enumerate(zip(poses[:-1], poses[1:], strict=True)):
+        clock.add_wheels(BEGIN_NS + k * STEP_NS + 3_000_000_000, wheels[k])
+        step = between(pose, following)
+        step[0] *= noise.normal() if k < 100 else 1.0
+        clock.add_step(BEGIN_NS + k * STEP_NS, BEGIN_NS + (k + 1) * STEP_NS, step)
+        useless.append(clock.truth.useless)
+    assert useless[149] and not useless[-1]
+    assert clock.truth.way_scale == pytest.approx(0.001, rel=0.5)
+
+
 def test_a_driver_that_begins_anew_at_the_origin_again_and_again_made_no_step() -> None:
     poses, wheels = drive(160), CorrectedWheels(ImuTurns())
     given = [record for record in records(poses) if isinstance(record, WheelPose)]

@@ -162,7 +162,8 @@ class WheelClock:
         if near.any():
             lag = int(lags[near][np.argmax(correlation[near])])
             self._judge_scale(*_aligned(scans, wheels, lag), -1.0 if other_way else 1.0)
-            self.truth = replace(self.truth, useless=False)
+            # Wheels that drive as no robot does would say that it stands, until their scale is known.
+            self.truth = replace(self.truth, useless=self.truth.way_scale == 1.0 and _is_too_fast(wheels[:, 1]))
 
     def _judge_clock(self, offsets: Array, correlation: Array, best: int) -> None:
         here = np.abs(offsets - self.truth.offset_s) <= _NEAR_S
@@ -219,6 +220,12 @@ def _turned(rates: Array) -> float:
     """What is left of turns after each time, summed up (rad)."""
     cells = round(_NET_S / _CELL_S)
     return float(np.abs(np.add.reduceat(rates, np.arange(0, len(rates), cells))).sum() * _CELL_S)
+
+
+def _is_too_fast(speeds: Array) -> bool:
+    """Whether no robot drives as these speeds mostly are (m/s)."""
+    driven = np.abs(speeds[speeds != 0.0])
+    return bool(len(driven)) and not is_possible(np.array((np.median(driven), 0.0, 0.0)), 1.0)
 
 
 def _correlation(scans: Array, wheels: Array) -> tuple[Array, Array, Array]:
