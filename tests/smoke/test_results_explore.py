@@ -19,7 +19,7 @@ class DriftsSteadily(TruePosesMap):
     """Knows the true poses, and claims to be as wrong as it has driven for long."""
 
     def errors(self, truth: TruePoses) -> dict[str, float]:
-        return {"ate_m": 1e-9 * self._stamps_ns[-1]}
+        return {"ate_m": 1e-9 * float(truth.stamps_ns[-1])}
 
 
 TINY = Maze2DConfig(rows=2, cols=2)

@@ -90,21 +90,22 @@ class TruePosesMap:
 
     def __init__(self, first_xyyaw: np.ndarray) -> None:
         self.pose_xyyaw, self._map = first_xyyaw, ScanMap()
-        self._stamps_ns, self._poses = list[int](), list[np.ndarray]()
+        self._stamps_ns, self._poses = np.zeros(0, np.int64), np.zeros((0, 3))  # of the scans that the map takes
 
     def take(self, sight: Sight) -> None:
         """Take what was seen, and where."""
-        stamp_ns, nothing = round(1e9 * sight.time_s), np.zeros(0, np.float32)
-        self._stamps_ns.append(stamp_ns)
-        self._poses.append(sight.pose_xyyaw)
-        before_ns, first_ns = self._stamps_ns[-2:][0], self._stamps_ns[0]
+        stamp_ns, waiting, nothing = round(1e9 * sight.time_s), self._map.waiting, np.zeros(0, np.float32)
+        first_ns = int(np.append(self._stamps_ns, stamp_ns)[0])
         self.pose_xyyaw = sight.pose_xyyaw
         pose = np.zeros(3), np.eye(3), first_ns, sight.pose_xyyaw
-        self._map.take(RelativeStep(stamp_ns, before_ns, *pose, nothing, nothing), [(stamp_ns, sight.scan)])
+        self._map.take(RelativeStep(stamp_ns, stamp_ns, *pose, nothing, nothing), [(stamp_ns, sight.scan)])
+        if self._map.waiting > waiting:
+            self._stamps_ns = np.append(self._stamps_ns, stamp_ns)
+            self._poses = np.vstack((self._poses, sight.pose_xyyaw))
 
     def cells(self) -> OccupancyMap:
         """The map so far."""
-        self._map.update(np.array(self._stamps_ns), np.array(self._poses))
+        self._map.update(self._stamps_ns, self._poses)
         return self._map.cells()
 
     def aligned_cells(self, truth: TruePoses) -> OccupancyMap:
@@ -126,7 +127,7 @@ class Seen:
             grid.add(scans[begin : begin + 200], poses[begin : begin + 200])
         self.map = _trinary(grid.cells(_OCCUPANCY))
         self._free = self.map.values == 0
-        self._count = int(np.count_nonzero(self._free))
+        self._cells = int(np.count_nonzero(self._free))
 
     def in_reach(self, world: ExploredWorld) -> Seen:
         """What can be seen of it from where a way leads to from where the robot is, as doors stand now."""
@@ -139,16 +140,23 @@ class Seen:
 
     def coverage(self, found: OccupancyMap) -> float:
         """Share of the free cells that can be seen which a map knows; 1 where there are none."""
-        if not self._count:
-            return 1.0
+        return self.share(self.count(found))
+
+    def share(self, count: int) -> float:
+        """So many of the free cells that can be seen, as a share; 1 where there are none."""
+        return count / self._cells if self._cells else 1.0
+
+    def count(self, found: OccupancyMap) -> int:
+        """How many of the free cells that can be seen a map, or a part of one, knows."""
+        known = _trinary(found).values != UNKNOWN
         column, row = np.rint((found.origin_xy - self.map.origin_xy) / RESOLUTION_M).astype(int).tolist()
         rows, columns = self._free.shape
         top, left = max(0, row), max(0, column)
         low, right = min(rows, row + found.values.shape[0]), min(columns, column + found.values.shape[1])
         if top >= low or left >= right:
-            return 0.0
-        known = found.values[top - row : low - row, left - column : right - column] != UNKNOWN
-        return float(np.count_nonzero(known & self._free[top:low, left:right])) / self._count
+            return 0
+        known = known[top - row : low - row, left - column : right - column]
+        return int(np.count_nonzero(known & self._free[top:low, left:right]))
 
 
 def explore(
@@ -204,7 +212,8 @@ class _Run:
         self._entered: np.ndarray | None = None
         self._mapped_s, self._path_m, self._collisions, self._touched, self._ended = -math.inf, 0.0, 0, False, False
         self._enough: dict[str, float] | None = None
-        self.found = _trinary(self._estimator.cells())
+        self.found = self._estimator.cells()
+        self._true, self._count = self._grid.cells(_OCCUPANCY), 0  # what was seen at true poses, and what counts of it
 
     @property
     def pose_xyyaw(self) -> np.ndarray:
@@ -230,7 +239,8 @@ class _Run:
             mapped, decided = self.look(), pilot.decided
             begun_s = time.process_time() if mapped else 0.0  # asking costs as much as a step
             if mapped or exploration.known.empty:
-                exploration.known.update(self.found.values, RESOLUTION_M, self.found.origin_xy)
+                found = self.found
+                exploration.known.update(found.values, RESOLUTION_M, found.origin_xy, found.changed)
             pilot.step(self.pose_xyyaw, self.sight.time_s)
             if mapped and pilot.decided > decided:
                 self._decisions_ms.append(1e3 * (time.process_time() - begun_s))
@@ -247,9 +257,13 @@ class _Run:
         if sight.time_s - self._mapped_s < _MAP_EVERY_S - 1e-6:
             return False
         self._mapped_s = sight.time_s
-        self.found = _trinary(self._estimator.cells())
-        seen = _trinary(self._grid.cells(_OCCUPANCY))
-        self._rows.append((self._path_m, self._seen.coverage(seen), sight.time_s))
+        self.found = self._estimator.cells()
+        before, self._true = self._true, self._grid.cells(_OCCUPANCY)
+        if (part := self._true.changed) is None:
+            self._count = self._seen.count(self._true)
+        else:
+            self._count += self._seen.count(self._true.part(*part)) - self._seen.count(before.part(*part))
+        self._rows.append((self._path_m, self._seen.share(self._count), sight.time_s))
         if self._enough is None and self._rows[-1][1] >= ENOUGH:
             self._enough = self._estimator.errors(self._truth())
         return True

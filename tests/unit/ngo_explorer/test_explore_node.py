@@ -6,10 +6,13 @@ from typing import Any
 import numpy as np
 import pytest
 from builtin_interfaces.msg import Time
+from map_msgs.msg import OccupancyGridUpdate
+from nav_msgs.msg import MapMetaData, OccupancyGrid
 from ngo_msgs.action import Explore
 from sensor_msgs.msg import LaserScan
 
 from ngo_explorer.exploration import Exploration
+from ngo_explorer.known_map import FREE, KnownMap
 from ngo_explorer.nodes import world_input
 from ngo_explorer.nodes.drivers import PublishedGoals
 from ngo_explorer.nodes.explore_node import ExploreNode
@@ -45,6 +48,20 @@ def test_only_its_own_new_transforms_tell_where_the_robot_is(monkeypatch: pytest
     world.now_s = 5.0
     assert world.hear("wheel", 12) == world.hear("base_link", 7) == "there is no new pose"
     assert world.hear("base_link", 12) == ""
+
+
+def test_parts_of_a_map_that_come_between_two_decisions_all_count(monkeypatch: pytest.MonkeyPatch) -> None:
+    world, one, other = Clocked(monkeypatch), KnownMap(0.2, 0.6), KnownMap(0.2, 0.6)
+    info = MapMetaData(width=20, height=20, resolution=0.1)
+    world.input._on_map(OccupancyGrid(info=info, data=[-1] * 400))
+    world.input.give_map(one)
+    for x, y in ((2, 3), (10, 12), (17, 0)):
+        world.input._on_update(OccupancyGridUpdate(x=x, y=y, width=2, height=4, data=[0] * 8))
+        if x == 10:
+            world.input.give_map(one)
+            assert np.count_nonzero(one.state == FREE) == 16
+    world.input.give_map(other)
+    assert np.count_nonzero(other.state == FREE) == 24, "a new exploration gets the whole map"
 
 
 def test_it_does_not_drive_where_no_scan_comes(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 from scipy.ndimage import distance_transform_edt
 
-from ngo_explorer.known_map import FREE, OCCUPIED, KnownMap
+from ngo_explorer.known_map import FREE, OCCUPIED, UNKNOWN, KnownMap
 
 RADIUS_M, COMFORT_M = 0.22, 0.6
 
@@ -29,11 +29,11 @@ def test_what_follows_from_the_cells_is_the_same_after_many_updates_as_after_one
     rng = np.random.default_rng(3)
     followed, origin = known(), np.array((2.0, -1.0))
     values = random_map(rng, 150, 210)
-    for _ in range(8):
+    for number in range(8):
         row, column = rng.integers(100), rng.integers(150)
-        part = values[row : row + 40, column : column + 50]
-        part[:] = rng.choice((-1, 0, 100), part.shape, p=(0.1, 0.85, 0.05))
-        followed.update(values, 0.05, origin)
+        part = slice(row, row + 40), slice(column, column + 50)
+        values[part] = rng.choice((-1, 0, 100), values[part].shape, p=(0.1, 0.85, 0.05))
+        followed.update(values, 0.05, origin, part if number % 2 else None)
     # The map grows to the lower left, as when a robot comes to a new wing.
     grown = np.pad(values, ((70, 0), (90, 30)), constant_values=-1)
     grown[:30, :40] = 0
@@ -92,5 +92,12 @@ def test_a_mark_stays_through_updates_until_it_is_forgotten(comfort_m: float) ->
     assert known.state[2, 20] == FREE, "the wall beside it is the same"
     known.update(np.pad(values, ((0, 3), (2, 0))), 0.1, np.array((-0.2, 0.0)))
     assert known.state[known.cell(np.array((2.05, 2.05)))] == OCCUPIED
+    grown, origin, mark = np.pad(values, ((0, 3), (2, 0))), np.array((-0.2, 0.0)), known.cell(np.array((2.05, 2.05)))
+    for part in ((slice(15, 25), slice(20, 30)), (slice(0, 5), slice(0, 5))):
+        known.update(grown, 0.1, origin, part)
+        assert known.state[mark] == OCCUPIED
     assert known.forget_marks() and not known.forget_marks()
-    assert known.state[known.cell(np.array((2.05, 2.05)))] == FREE
+    assert known.state[mark] == FREE
+    grown[20, 22] = -1
+    known.update(grown, 0.1, origin, (slice(0, 5), slice(0, 5)))
+    assert known.state[mark] == UNKNOWN, "after marks are forgotten the whole map says what is there"

@@ -70,19 +70,18 @@ class FrontierFinder:
             self._labels = np.zeros(known.frontier.size, np.int32)
         longest = int(min(self._piece_m / known.resolution_m, 2**31 - 1))
         order, starts = _connected(cells, known.frontier, self._labels, max(1, longest))
-        found, short = [], []
-        columns = known.frontier.shape[1]
-        for begin, end in zip(starts[:-1].tolist(), starts[1:].tolist(), strict=True):
-            own = order[begin:end]
-            at = np.stack((own // columns, own % columns), axis=1)
-            across = 0.0 if self._by_cells else math.hypot(*np.ptp(at, axis=0).tolist()) + 1.0
-            size_m = max(len(own), across) * known.resolution_m
-            if size_m < self._least_m:
-                short.append(at[0])
-                continue
+        cells = np.stack(np.divmod(order, known.frontier.shape[1]), axis=1)
+        firsts, sizes = starts[:-1], np.diff(starts).astype(np.float64)
+        if len(order) and not self._by_cells:
+            spans = np.maximum.reduceat(cells, firsts) - np.minimum.reduceat(cells, firsts)
+            sizes = np.maximum(sizes, np.hypot(*spans.T) + 1.0)
+        sizes *= known.resolution_m
+        found, long = [], sizes >= self._least_m
+        for index in np.flatnonzero(long).tolist():
+            at = cells[starts[index] : starts[index + 1]]
             points, middle = known.points(at), np.argmin(np.sum((at - at.mean(axis=0)) ** 2, axis=1))
-            found.append(Frontier(points, points[middle], size_m))
-        self.short_xy = known.points(np.array(short, np.int64).reshape(-1, 2))
+            found.append(Frontier(points, points[middle], float(sizes[index])))
+        self.short_xy = known.points(cells[firsts[~long]])
         return found
 
 

@@ -1,7 +1,7 @@
 """The occupancy grid as an explorer keeps it: clearance, frontier cells and blocks, updated where it changed.
 
 All arrays cover whole tiles. What follows from the cells of a tile is computed anew when one of its cells changes, so
-an update costs what changed, and one comparison of the cells.
+an update costs what changed, and one comparison of the cells that may have.
 """
 
 from __future__ import annotations
@@ -40,6 +40,7 @@ class KnownMap:
         self.radius_m, self.comfort_m = radius_m, max(comfort_m, radius_m)
         self.resolution_m = 0.0
         self._marked = np.zeros((0, 2))
+        self._extent: tuple[int, ...] = ()  # of the last map, where the cells are still what it said
         self.changes = 0
         """Counts the updates that changed anything."""
 
@@ -48,20 +49,29 @@ class KnownMap:
         """Whether no map has come yet."""
         return self.resolution_m == 0.0
 
-    def update(self, values: NDArray[np.int8], resolution_m: float, origin_xy: Floats) -> bool:
+    def update(
+        self,
+        values: NDArray[np.int8],
+        resolution_m: float,
+        origin_xy: Floats,
+        changed: tuple[slice, slice] | None = None,
+    ) -> bool:
         """Take a whole map; returns whether a cell changed.
 
         values: ``(rows, columns)`` percent, -1 where nothing is known. Cells up to 25 are free, from 65 on occupied,
         and the rest unknown. origin_xy: ``(2,)`` lower left corner of cell [0, 0]. Extent and origin may be others than
-        before; cells that the map does not hold become unknown.
+        before; cells that the map does not hold become unknown. changed: rows and columns outside of which the values
+        are those of the last map; None: all may be others.
         """
         self._begin(resolution_m, origin_xy)
         row, column = self._offset(origin_xy)
         self._cover(row, column, *values.shape)
-        inside = slice(row - self._low[0], row - self._low[0] + values.shape[0])
-        across = slice(column - self._low[1], column - self._low[1] + values.shape[1])
+        extent, self._extent = self._extent, (row, column, *values.shape)
+        row, column = row - self._low[0], column - self._low[1]
+        if changed is not None and extent == self._extent:
+            return self._take(values[changed].copy(), row + changed[0].start, column + changed[1].start)
         placed = np.full(self.state.shape, UNKNOWN, np.int8)
-        placed[inside, across] = values
+        placed[row : row + values.shape[0], column : column + values.shape[1]] = values
         return self._take(placed)
 
     def mark(self, points_xy: Floats) -> None:
@@ -81,7 +91,7 @@ class KnownMap:
             return False
         values = self._values()
         values[tuple(self.cells(self._marked).T)] = FREE
-        self._marked = np.zeros((0, 2))
+        self._marked, self._extent = np.zeros((0, 2)), ()
         self._take(values)
         return True
 
@@ -160,16 +170,18 @@ class KnownMap:
         self._low = (low[0], low[1])
         self._corner = self._anchor + np.array((low[1], low[0])) * self.resolution_m
 
-    def _take(self, values: NDArray[np.int8]) -> bool:
+    def _take(self, values: NDArray[np.int8], row: int = 0, column: int = 0) -> bool:
+        """Enter values from a row and column on."""
         if len(self._marked):
-            values[tuple(self.cells(self._marked).T)] = 100
+            marked = self.cells(self._marked) - (row, column)
+            values[tuple(marked[((marked >= 0) & (marked < values.shape)).all(axis=1)].T)] = 100
         tile, changed = self._tile, np.zeros(self._known.shape, np.int8)
-        _write(self.state, values, tile, int(self.comfort_m / self.resolution_m), changed)
+        _write(self.state, values, row, column, tile, int(self.comfort_m / self.resolution_m), changed)
         if not changed.any():
             return False
         self.changes += 1
-        for row, column in np.argwhere(changed).tolist():
-            self._follow(row, column, bool(changed[row, column] == _NEAR_WALLS))
+        for tile_row, tile_column in np.argwhere(changed).tolist():
+            self._follow(tile_row, tile_column, bool(changed[tile_row, tile_column] == _NEAR_WALLS))
         return True
 
     def _follow(self, tile_row: int, tile_column: int, near_walls: bool) -> None:
@@ -193,13 +205,15 @@ def _grown(before: NDArray, shape: tuple[int, int], shift: tuple[int, int], unit
 
 
 @njit(cache=True)
-def _write(state: Cells, values: NDArray[np.int8], tile: int, reach: int, changed: NDArray[np.int8]) -> None:
+def _write(
+    state: Cells, values: NDArray[np.int8], row0: int, column0: int, tile: int, reach: int, changed: NDArray[np.int8]
+) -> None:
     """Enter values in percent, and mark the tiles in and beside which a cell changes, or up to ``reach`` from a wall's.
     """
     rows, columns = state.shape
-    for row in range(rows):
-        for column in range(columns):
-            value = values[row, column]
+    for row in range(row0, row0 + values.shape[0]):
+        for column in range(column0, column0 + values.shape[1]):
+            value = values[row - row0, column - column0]
             now = UNKNOWN if value < 0 or 25 < value < 65 else FREE if value <= 25 else OCCUPIED
             before = state[row, column]
             if before != now:

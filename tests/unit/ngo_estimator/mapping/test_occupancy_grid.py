@@ -137,6 +137,26 @@ def test_neither_order_nor_growth_nor_looks_in_between_change_the_map() -> None:
     np.testing.assert_array_equal(together.cells(SURE).values, one_by_one.cells(SURE).values)
 
 
+def test_a_map_says_which_part_of_it_has_changed() -> None:
+    scans, poses = random_scans(12, 4)
+    grid, parts = OccupancyGrid(0.05), list[int]()
+    grid.add(scans, poses)
+    before = grid.cells(SURE)
+    assert before.changed is None
+    for k in range(12):
+        grid.remove(scans[k : k + 1], poses[k : k + 1])
+        grid.add(scans[k : k + 1], poses[k : k + 1] * 0.5)
+        now = grid.cells(SURE)
+        assert now.changed is not None
+        outside = np.ones(now.values.shape, np.bool_)
+        outside[now.changed] = False
+        assert (now.values[outside] == before.values[outside]).all()
+        parts.append(int(outside.sum()))
+        before = now
+    assert max(parts) > 0
+    assert grid.cells(SURE).part(*grid.cells(SURE).changed).values.size == 0
+
+
 def test_a_map_too_large_for_memory_is_refused_and_the_rest_stays() -> None:
     grid = OccupancyGrid(0.05)
     grid.add([rays((0.0, 3.0))], ORIGIN)

@@ -60,12 +60,14 @@ class OccupancyMap:
     """Values ``(rows, columns)`` of a map's cells.
 
     Row 0 is the lowest in y, column 0 the lowest in x, and ``origin_xy`` ``(2,)`` the lower left corner of cell [0, 0]
-    (m). Values are percent, or -1 where nothing is known.
+    (m). Values are percent, or -1 where nothing is known. Outside of the rows and columns ``changed`` they are those of
+    the map that the same grid gave before; None: its extent was another, or nobody knows.
     """
 
     values: NDArray[np.int8]
     resolution_m: float
     origin_xy: Array
+    changed: tuple[slice, slice] | None = None
 
     def trinary(self, free: float, occupied: float) -> "OccupancyMap":
         """The same map with the values 0 up to the probability ``free``, 100 from ``occupied`` on, else -1."""
@@ -80,9 +82,12 @@ class OccupancyMap:
         rows, columns = (np.flatnonzero(known.any(axis=axis)) for axis in (1, 0))
         if not len(rows):
             return OccupancyMap(np.zeros((0, 0), np.int8), self.resolution_m, self.origin_xy)
-        part = slice(rows[0], rows[-1] + 1), slice(columns[0], columns[-1] + 1)
-        corner = self.origin_xy + self.resolution_m * np.array((columns[0], rows[0]))
-        return OccupancyMap(self.values[part], self.resolution_m, corner)
+        return self.part(slice(rows[0], rows[-1] + 1), slice(columns[0], columns[-1] + 1))
+
+    def part(self, rows: slice, columns: slice) -> "OccupancyMap":
+        """The part of some rows and columns."""
+        corner = self.origin_xy + self.resolution_m * np.array((columns.start, rows.start))
+        return OccupancyMap(self.values[rows, columns], self.resolution_m, corner)
 
 
 class MapTooLarge(ValueError):
@@ -134,13 +139,15 @@ class OccupancyGrid:
         Where no scan was entered or removed since the last call they are those of then.
         """
         rows, columns, _ = self._cells.shape
+        top, left, low, right = self._stale
+        changed: tuple[slice, slice] | None = (slice(top, low), slice(left, right))
         if self._values.shape != (rows, columns) or config != self._of:
             self._values, self._of = np.empty((rows, columns), np.int8), config
-            self._stale = (0, 0, rows, columns)
+            self._stale, changed = (0, 0, rows, columns), None
         _percent(self._cells, self._values, *self._stale, config.hit, config.passed, config.settled)
         self._stale = _NOTHING
         corner = (self._low.astype(np.float64) - 0.5) * self.resolution_m
-        return OccupancyMap(self._values.copy(), self.resolution_m, corner)
+        return OccupancyMap(self._values.copy(), self.resolution_m, corner, changed)
 
     @classmethod
     def summed(cls, grids: Sequence["OccupancyGrid"]) -> "OccupancyGrid":

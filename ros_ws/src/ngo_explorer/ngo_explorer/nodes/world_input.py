@@ -25,6 +25,7 @@ from ngo_recordings.transform_buffer import TransformBuffer
 
 _LOST = ("lost:", "not localised")  # in the message of a status
 _TURNED_RAD = 1e-3
+_NOTHING = slice(0, 0), slice(0, 0)  # rows and columns
 
 
 class WorldInput:
@@ -43,6 +44,7 @@ class WorldInput:
         self._lost = ""
         self._whole: tuple[Cells, float, Floats] | None = None
         self._changed = False
+        self._part: tuple[slice, slice] | None = _NOTHING  # what of it has changed; None: all may have
         latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
         static = QoSProfile(depth=100, durability=DurabilityPolicy.TRANSIENT_LOCAL)
         node.create_subscription(OccupancyGrid, settings.map_topic, self._on_map, latched)
@@ -109,8 +111,8 @@ class WorldInput:
     def give_map(self, known: KnownMap) -> None:
         """Let an exploration have the newest map, if it has changed; raises ValueError where it cannot take it."""
         if self._whole is not None and (self._changed or known.empty):
-            self._changed = False
-            known.update(*self._whole)
+            changed, self._changed, self._part = self._part, False, _NOTHING
+            known.update(*self._whole, changed)
 
     def _on_map(self, message: OccupancyGrid) -> None:
         info, origin = message.info, message.info.origin
@@ -120,7 +122,7 @@ class WorldInput:
             return
         corner = np.array((origin.position.x, origin.position.y))
         self._whole = values.reshape(info.height, info.width), float(info.resolution), corner
-        self._changed = True
+        self._changed, self._part = True, None
 
     def _on_update(self, message: OccupancyGridUpdate) -> None:
         if self._whole is None:
@@ -133,6 +135,8 @@ class WorldInput:
             return
         values[rows, message.x : columns] = part.reshape(message.height, message.width)
         self._changed = True
+        if self._part is not None:
+            self._part = _joined(self._part[0], rows), _joined(self._part[1], slice(message.x, columns))
 
     def _on_static(self, message: TFMessage) -> None:
         self._tree.take(message, static=True)
@@ -178,3 +182,8 @@ class WorldInput:
 
     def _dropped(self, what: str, why: str) -> None:
         self._node.get_logger().warning(f"dropped {what}: {why}", throttle_duration_sec=5.0)
+
+
+def _joined(one: slice, other: slice) -> slice:
+    """The smallest that holds both; an empty one counts for nothing."""
+    return slice(min(one.start, other.start), max(one.stop, other.stop)) if one.stop > one.start else other
