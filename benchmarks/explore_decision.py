@@ -68,7 +68,7 @@ def main() -> None:
         part = slice(max(0, row - _SEEN), row + _SEEN), slice(max(0, column - _SEEN), column + _SEEN)
         known[part] = truth[part]
         updated_s = time.process_time()
-        exploration.known.update(known, _RESOLUTION_M, np.zeros(2))
+        exploration.known.update(known, _RESOLUTION_M, np.zeros(2), part)
         updates.append(1e3 * (time.process_time() - updated_s))
         decisions.append(1e3 * (decided_s - begun_s) + updates[-1])
         exploration.arrived()
