@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from ngo_estimator.frontend.intake.lidar_intake import LidarIntake, MountingOf
+from ngo_estimator.frontend.intake.lidar_intake import LidarIntake, MountingOf, scanner_of
 from ngo_estimator.frontend.intake.wheel_clock import WheelTruth
 from ngo_estimator.frontend.lidar.mixture_lidar import MixtureLidar
 from ngo_estimator.geometry.scan_points import Mounting
@@ -23,6 +23,8 @@ _LEARNED_SCANS = 600
 _LEARNED_M, _LEARNED_RAD = 6.0, 6.0  # Way and turn after which faults of scanners and wheels are known.
 
 _LOST_SHARE = 0.01  # Of the first scans: with so many that do not say where they were taken, wheels are doubted.
+
+_OTHER_CLOCK_S = 0.15  # Scanners whose ages differ by more are not put together.
 
 _TO_BLAME = 0.5  # Without wheels that are to blame, fewer scans than this share of those get lost.
 
@@ -86,8 +88,9 @@ class LidarRun(Run):
         wheels. Returns what is wrong with the wheels. Live, it is learned on the way.
         """
         read: list[LidarRecord] = []
-        lost = self._look_at(records, read)
-        known = self._odometry.keep_lag()
+        lost, known = self._look_at(records, read), self._odometry.keep_lag()
+        if self._leaves_out(read):
+            lost, known = self._look_at(read, []), self._odometry.keep_lag()
         if lost > _LOST_SHARE and self._odometry.has_wheels:
             self._odometry.reset()
             self._odometry.judge_wheels(WheelTruth(useless=True))
@@ -95,9 +98,28 @@ class LidarRun(Run):
             doubted = self._odometry.keep_lag()
             if not doubted.useless or alone < _TO_BLAME * lost:
                 known = doubted
-            self._odometry.judge_wheels(known)
+        self._odometry.judge_wheels(known)
         self._odometry.reset()
         return known
+
+    def _leaves_out(self, read: list[LidarRecord]) -> bool:
+        """Leave out scanners whose stamps contradict those of the one that agrees best with the wheels."""
+        names, ages = self._odometry.scanners, {}
+        if len(names) < 2 or not self._odometry.has_wheels:
+            return False
+        for name in names:
+            self._begin_anew()
+            self._look_at([each for each in read if not isinstance(each, LidarScan) or scanner_of(each) == name], [])
+            known = self._odometry.keep_lag()
+            ages[name] = known.age_s - known.offset_s
+        best = min(ages.values(), key=abs)
+        self._odometry.left_out = {name: age - best for name, age in ages.items() if abs(age - best) > _OTHER_CLOCK_S}
+        self._begin_anew()
+        return bool(self._odometry.left_out)
+
+    def _begin_anew(self) -> None:
+        self._odometry.reset()
+        self._odometry.judge_wheels(WheelTruth())
 
     def _look_at(self, records: Iterable[LidarRecord], read: list[LidarRecord]) -> float:
         """Go over records until enough is known, and keep what was read; returns the share of scans that got lost."""

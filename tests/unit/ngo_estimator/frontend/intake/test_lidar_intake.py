@@ -14,6 +14,7 @@ from ngo_estimator.offline.lidar_run import LidarRun
 from ngo_estimator.offline.recorded import RecordedRun
 from ngo_estimator.slam.scan_trajectory import ScanTrajectory
 from ngo_recordings.scan_stream import LidarScan, WheelPose
+from tests.unit.ngo_estimator.frontend.intake.test_sweep_and_wheel_clock import drive
 from tests.unit.ngo_estimator.ray_casting import ROOM, cast
 
 STEP_NS = 100_000_000
@@ -92,6 +93,23 @@ def test_two_scanners_on_a_topic_are_registered_together(apart: float) -> None:
         [each for each in records if each.frame_id == "front" or each.stamp_ns < 10**12 + 10**9], true, mountings.get
     )
     assert off.max() < 0.03 + 0.05 * apart and run.remarks() == ["nothing more comes from rear"]
+
+
+@pytest.mark.parametrize("late_s", [0.0, 0.4])
+def test_a_scanner_whose_stamps_contradict_the_other_one_is_left_out(late_s: float) -> None:
+    noise, true, made = np.random.default_rng(0), drive(200), []
+    for k, pose in enumerate(true):
+        made.append(WheelPose(10**12 + k * STEP_NS, between(true[0], pose)))
+        made.append(scan(pose, k, FRONT, -1.4, 1.4, RAYS // 2, "front", noise))
+        made.append(scan(pose, k + late_s / (STEP_NS * 1e-9), REAR, -1.4, 1.4, RAYS // 2, "rear", noise))
+    made.sort(key=lambda record: record.stamp_ns)
+    run = LidarRun(MixtureLidar(), ScanTrajectory(iterations_per_step=1), {"front": FRONT, "rear": REAR}.get)
+    run.learn(made)
+    whole = next(event for event in run.run(made) if isinstance(event, RecordedRun)).trajectory
+    off = [between(true[0], pose) for pose in true[: len(whole.poses_xyyaw)]] - whole.poses_xyyaw
+    assert np.abs(off[:, :2]).max() < 0.04
+    told = [float(line.split()[7]) for line in run.remarks() if line.startswith("rear is left out")]
+    assert told == pytest.approx([late_s] if late_s else [], abs=0.1) and len(run.remarks()) == len(told)
 
 
 def test_a_value_that_means_no_return_makes_no_wall() -> None:

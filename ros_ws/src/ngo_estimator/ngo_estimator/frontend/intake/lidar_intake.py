@@ -45,6 +45,8 @@ class LidarIntake:
     def __init__(self, front_end: MixtureLidar, mounting_of: MountingOf, min_range_m: float = 0.0) -> None:
         self.front_end, self._mounting_of, self._min_range_m = front_end, mounting_of, min_range_m
         self._scanners: dict[str, Scanner] = {}
+        self.left_out: dict[str, float] = {}
+        """Scanners that are not used, and how much older their scans are than those of the others (s)."""
         self._clock = WheelClock()
         self._imu = ImuTurns()
         self._floor = FloorRays()
@@ -78,6 +80,11 @@ class LidarIntake:
     def has_wheels(self) -> bool:
         """Whether wheel odometry came since the start."""
         return self.front_end.has_wheels
+
+    @property
+    def scanners(self) -> list[str]:
+        """The scanners that were heard and whose mounting is known."""
+        return [name for name in self._scanners if self._mountings.get(name) is not None]
 
     @property
     def lag_s(self) -> float:
@@ -130,7 +137,9 @@ class LidarIntake:
             self._take(each)
 
     def _take(self, scan: LidarScan) -> None:
-        scanner = f"{scan.topic} {scan.frame_id}".strip()
+        scanner = scanner_of(scan)
+        if scanner in self.left_out:
+            return
         if scanner not in self._mountings:
             self._meet(scanner, scan.frame_id)
         mounting = self._mountings[scanner]
@@ -236,9 +245,19 @@ class LidarIntake:
         return list(fresh.values())
 
     def problems(self) -> list[str]:
-        """A line for each scanner that is missing."""
+        """A line for each scanner that is missing or left out."""
         lines = [f"{name} is left out: its mounting is not known" for name, at in self._mountings.items() if at is None]
+        lines += [
+            f"{name} is left out: its scans are {abs(age_s):.2f} s {'older' if age_s > 0.0 else 'younger'} than those "
+            "of the others at the same stamps, by the wheels"
+            for name, age_s in self.left_out.items()
+        ]
         return [*lines, *(f"nothing more comes from {name}" for name in self._turns.silent())]
+
+
+def scanner_of(scan: LidarScan) -> str:
+    """The name of the scanner that a scan is from."""
+    return f"{scan.topic} {scan.frame_id}".strip()
 
 
 def _contradicts(motion: Array | None, step: Array) -> bool:
