@@ -73,6 +73,7 @@ def test_odometry_of_another_type_counts_where_it_is_named(tmp_path: Path, kind:
         (note,) = describe_lidar(recording, choose_topics(recording)).notes
         assert "if it is /encoders (10.0 Hz), --wheels names it" in note
         topics = choose_topics(recording, TopicArguments(wheels="/encoders"))
+        assert "wheels: /encoders, 9 poses" in describe_lidar(recording, topics).lines()
         poses = [each.pose_xyyaw for each in scan_stream(recording, topics) if isinstance(each, WheelPose)]
     np.testing.assert_allclose(poses, [(0.1 * k, 0.0, 0.0) for k in range(9)], atol=1e-12)
 

@@ -186,6 +186,14 @@ def test_the_unit_is_that_of_the_topic_and_not_of_each_message(usual: float, onc
     assert off_walls(scans[3]).max() < 0.02 and off_walls(scans[-1]).max() < 0.02
 
 
+@pytest.mark.parametrize("mm_first", [True, False])
+def test_a_sensor_in_millimetres_may_stand_at_a_wall(mm_first: bool) -> None:
+    unit, room = DistanceUnit(), turning()[0]
+    scales = [*[1000.0] * mm_first, *[50.0] * 12, 1000.0, *[50.0] * 12, 1000.0]
+    notes = [cloud_scan(m.cloud(BEGIN_NS, fields(scale * room)), "/points", unit).note for scale in scales]
+    assert [bool(note) for note in notes] == [mm_first] * (12 + mm_first) + [True] * 14
+
+
 @pytest.mark.parametrize("frame", ["robot1/base_link", "lidar"])
 def test_points_in_the_robots_own_frame_have_the_floor_at_zero(frame: str) -> None:
     on_robot = frame != "lidar"

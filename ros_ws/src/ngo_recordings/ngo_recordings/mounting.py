@@ -162,7 +162,7 @@ def _wheel_frame(recording: Recording, topics: RecordingTopics) -> str:
     if topics.wheels.tf is not None:
         return topics.wheels.tf[1]
     first = recording.first(str(topics.wheels.topic))
-    return str(first.value.child_frame_id).strip("/")
+    return str(getattr(first.value, "child_frame_id", "")).strip("/")  # poses and velocities have none
 
 
 def _transforms(recording: Recording, names: list[str]) -> Iterator[tuple[int, Any]]:

@@ -36,8 +36,8 @@ _FARTHEST_DEPTH_M = 5.0
 _SANE_M, _MOSTLY = (1e-5, 1e5), 0.8
 """Coordinates are within these, mostly; else the driver says the wrong order of bytes, which PCL does not read."""
 
-_FAR, _NEARLY_ALL = 200.0, 0.1
-"""No sensor of a robot sees all but this share of its points so far away (m)."""
+_NEAR, _FAR, _NEARLY_ALL = 20.0, 200.0, 0.1
+"""No sensor of a robot sees all but this share of its points so far away (m), or more than it so near (mm)."""
 _FEWEST, _ALIKE = 20, 0.999
 """Fewer tell no unit, and those within this of the farthest one say that nothing came back."""
 _AGAIN = 10
@@ -70,8 +70,9 @@ class DistanceUnit:
         """The unit (m), where a message has these distances."""
         seen = values[np.isfinite(values) & (values > 0.0)]
         seen = seen[seen < _ALIKE * seen.max(initial=0.0)]
-        if len(seen) >= _FEWEST:
-            found_m = 0.001 if np.quantile(seen, _NEARLY_ALL) > _FAR else 1.0
+        near = np.quantile(seen, _NEARLY_ALL) if len(seen) >= _FEWEST else _NEAR
+        if not _NEAR <= near <= _FAR:  # between them it may be either
+            found_m = 0.001 if near > _FAR else 1.0
             self._others = 0 if found_m == self._unit_m else self._others + 1
             if self._unit_m is None or self._others >= _AGAIN:
                 self._unit_m, self._others = found_m, 0
