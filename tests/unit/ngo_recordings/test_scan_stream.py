@@ -68,10 +68,13 @@ def test_odometry_of_another_type_counts_where_it_is_named(tmp_path: Path, kind:
         return m.make(f"geometry_msgs/msg/{kind}", m.header(stamp(k), "odom"), inside[kind])
 
     entries = [("/scan", stamp(k), scan(stamp(k))) for k in range(9)]
-    entries += [("/encoders", stamp(k), wheels(k)) for k in range(9)]
+    entries += [(name, stamp(k), wheels(k)) for name in ("/encoders", "/cmd_vel", "/goal_pose") for k in range(9)]
+    in_map = m.make("geometry_msgs/msg/PoseStamped", m.header(stamp(0), "map"), m.pose(1.0, 0.0, 0.0))
+    entries += [("/localization", stamp(k), in_map) for k in range(9)]
     with open_recording([m.write_mcap(tmp_path / "a.mcap", entries)]) as recording:
         (note,) = describe_lidar(recording, choose_topics(recording)).notes
         assert "if it is /encoders (10.0 Hz), --wheels names it" in note
+        assert not describe_lidar(recording, choose_topics(recording, TopicArguments(wheels="none"))).notes
         topics = choose_topics(recording, TopicArguments(wheels="/encoders"))
         assert "wheels: /encoders, 9 poses" in describe_lidar(recording, topics).lines()
         poses = [each.pose_xyyaw for each in scan_stream(recording, topics) if isinstance(each, WheelPose)]
@@ -159,8 +162,8 @@ def test_wheels_of_transforms(tmp_path: Path, chained: bool) -> None:
     np.testing.assert_allclose(poses, expected, atol=1e-9)
 
 
-@pytest.mark.parametrize("parent", ["odom_combined", "world", "base_footprint"])
-def test_odometry_on_tf_below_any_frame_counts_and_below_a_global_one_is_named(tmp_path: Path, parent: str) -> None:
+@pytest.mark.parametrize("parent", ["odom_combined", "world", "start", "base_footprint", "base_stabilized"])
+def test_odometry_on_tf_below_a_frame_called_odom_counts_and_below_others_is_named(tmp_path: Path, parent: str) -> None:
     entries: list[m.Entry] = [("/tf_static", stamp(0), m.transforms(static("base_link", "laser", 0.5, 0, 0)))]
     for k in range(20):
         moved = m.transform(stamp(k), parent, "base_link", m.pose(0.1 * k, 0.0, 0.0))
@@ -169,7 +172,7 @@ def test_odometry_on_tf_below_any_frame_counts_and_below_a_global_one_is_named(t
         topics = choose_topics(recording)
         (*_, note) = ("", *describe_lidar(recording, topics).notes)
     assert str(topics.wheels) == ("tf:odom_combined:base_link" if parent == "odom_combined" else "None")
-    assert ("if it is tf:world:base_link, --wheels names it" in note) == (parent == "world")
+    assert (f"if it is tf:{parent}:base_link, --wheels names it" in note) == (parent in ("world", "start"))
 
 
 def test_of_several_echoes_the_first_counts(tmp_path: Path) -> None:

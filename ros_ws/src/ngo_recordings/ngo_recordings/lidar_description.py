@@ -13,7 +13,13 @@ from ngo_recordings.laser_scan import LidarScan, ScanAngles, scan_angles
 from ngo_recordings.mounting import Mounting, find_mounting
 from ngo_recordings.recording import Recording
 from ngo_recordings.space_scan import scan_reader
-from ngo_recordings.topics import WHEEL_TYPES, RecordingTopics, WheelSource, wheel_candidates, wheel_transforms
+from ngo_recordings.topics import (
+    RecordingTopics,
+    WheelSource,
+    wheel_candidates,
+    wheel_topics_to_name,
+    wheel_transforms,
+)
 
 _LOOK = 200
 
@@ -106,10 +112,11 @@ def _others(recording: Recording, topics: RecordingTopics, mounting: Mounting | 
                 f"two scanners have the frame {mounting.scan_frame}, and it has two places: robots whose frames have "
                 "the same names cannot be told apart, give each a prefix"
             )
+    if topics.no_wheels:
+        return notes
     if not wheels and topics.wheels is None:
-        truth = topics.ground_truth.topic if topics.ground_truth is not None else None
-        named = [name for name, info in recording.topics.items() if info.type_name in WHEEL_TYPES and info.count]
-        sources = [_with_rate(recording, name) for name in named if name != truth]
+        named = wheel_topics_to_name(recording, topics.image, topics.ground_truth)
+        sources = [_with_rate(recording, name) for name in named]
         sources += map(str, wheel_transforms(recording, topics.image, topics.ground_truth))
         if sources:
             notes.append(f"no odometry is used; if it is {' or '.join(sources)}, --wheels names it")

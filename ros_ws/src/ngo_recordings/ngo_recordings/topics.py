@@ -33,6 +33,7 @@ _GLOBAL_FRAMES = ("map", "world", "earth")
 _WHEEL_NAMES = tuple(re.compile(pattern, re.IGNORECASE) for pattern in (r"wheel|encoder|odom_enc", r"(^|/)odom$"))
 # How much of the transforms is looked through for odom -> base_link.
 _LOOK_NS = 10_000_000_000
+_COMMAND_NAMES = re.compile(r"cmd|command|goal|initial_?pose", re.IGNORECASE)
 _TRUTH_NAMES = re.compile(r"ground_?truth|(^|[/_])(gt|truth|mocap|vicon|optitrack)([/_]|$)", re.IGNORECASE)
 
 
@@ -134,7 +135,8 @@ class RecordingTopics:
 
     image: Image, CompressedImage, LaserScan, MultiEchoLaserScan or PointCloud2. depth: Image of depth, one more
     channel. action: DiscreteAction. twist: Twist, TwistStamped or Odometry. wheels, imu: wheel odometry and Imu, for
-    `scan_stream`. more_scans: those of other scanners. The times are those of TopicArguments.
+    `scan_stream`; no_wheels: none are wanted. more_scans: those of other scanners. The times are those of
+    TopicArguments.
     """
 
     image: str
@@ -146,6 +148,7 @@ class RecordingTopics:
     interpolation_s: float = 0.25
     twist_tolerance_s: float = 0.5
     wheels: WheelSource | None = None
+    no_wheels: bool = False
     more_scans: tuple[str, ...] = ()
     imu: str | None = None
 
@@ -167,8 +170,8 @@ def choose_topics(
     is a DiscreteAction that is no command; the twist, where there is no action, the only Twist or TwistStamped; the
     ground truth an Odometry or pose topic whose name says so. Where the image is of scans, or with_wheels, the wheels
     are the first of `wheel_candidates`, if it is the only one or its name says so; where there is none, the first of
-    `wheel_transforms` below a frame that is not global. With wheels, the IMU is the first of this robot. No more is
-    guessed.
+    `wheel_transforms` below a frame that is called odom, maybe with more. With wheels, the IMU is the first of this
+    robot. No more is guessed.
 
     Raises:
         RecordingError: a topic that is given is not there, empty or of another type, or the image topic is not clear.
@@ -204,6 +207,7 @@ def choose_topics(
         interpolation_s=given.interpolation_s,
         twist_tolerance_s=given.twist_tolerance_s,
         wheels=wheels,
+        no_wheels=given.wheels == _NONE,
         imu=imu,
         more_scans=more_scans,
     )
@@ -247,6 +251,19 @@ def wheel_candidates(recording: Recording, image: str, truth: GroundTruth | None
         if chosen := [key for *told, key in found if tuple(told) == wanted]:
             return [name for *_, name in sorted(chosen)]
     return []
+
+
+def wheel_topics_to_name(recording: Recording, image: str, truth: GroundTruth | None = None) -> list[str]:
+    """The topics that may be odometry where they are named: no truth, no command, no pose in a global frame, and a
+    message each second or more."""
+    span_s, frame, found = sum(b - a for a, b in recording.spans_ns(image)) * 1e-9, _scan_frame(recording, image), []
+    for name in _filled(recording, WHEEL_TYPES):
+        info, (parent, _) = recording.topics[name], _odometry_frames(recording, name)
+        other = _COMMAND_NAMES.search(name) or _TRUTH_NAMES.search(name) or (truth is not None and name == truth.topic)
+        of_map = info.type_name != ODOMETRY_TYPE and _is_any(_GLOBAL_FRAMES, parent, frame)
+        if not other and not of_map and info.count >= span_s:
+            found.append(name)
+    return found
 
 
 def _is_any(names: Iterable[str], frame: str, beside: str) -> bool:
@@ -353,8 +370,7 @@ def _choose_wheels(
         clear = len(candidates) == 1 or any(names.search(candidates[0]) for names in _WHEEL_NAMES)
         return WheelSource(candidates[0]) if clear else None
     sources = wheel_transforms(recording, image, truth)
-    frame = _scan_frame(recording, image)
-    return next((each for each in sources if each.tf and not _is_any(_GLOBAL_FRAMES, each.tf[0], frame)), None)
+    return next((each for each in sources if each.tf and _called_odom(each.tf[0])), None)
 
 
 def _scan_frame(recording: Recording, image: str) -> str:
@@ -389,7 +405,8 @@ def _first_transforms(recording: Recording, image: str) -> tuple[TransformBuffer
 
 def wheel_transforms(recording: Recording, image: str, truth: GroundTruth | None = None) -> list[WheelSource]:
     """The transforms of the first seconds that may be odometry, the best one first: below odom those that carry the
-    scanner, and others to the robot; then those that carry it below any other frame, global ones last."""
+    scanner, and others to the robot; then those that carry it below any other frame but the robot's, odom in its name
+    first."""
     scan = _scan_frame(recording, image)
     tree, moving = _first_transforms(recording, image)
     above, found = tree.above(scan), []
@@ -400,9 +417,13 @@ def wheel_transforms(recording: Recording, image: str, truth: GroundTruth | None
             continue
         if is_named(parent, _ODOMETRY_FRAME, scan) and (carries or robot):
             found.append((0 if carries else 1, WheelSource(tf=frames)))
-        elif carries and robot and not _is_any(_BASE_FRAMES, parent, scan):
-            found.append((3 if _is_any(_GLOBAL_FRAMES, parent, scan) else 2, WheelSource(tf=frames)))
+        elif carries and robot and (_called_odom(parent) or "base" not in parent):
+            found.append((2 if _called_odom(parent) else 3, WheelSource(tf=frames)))
     return [source for _, source in sorted(found, key=lambda each: each[0])]
+
+
+def _called_odom(frame: str) -> bool:
+    return _ODOMETRY_FRAME in frame.rpartition("/")[2]
 
 
 def _frames(text: str, use: str, example: str) -> tuple[str, str]:
