@@ -19,6 +19,8 @@ from ngo_recordings.scan_stream import ImuReading, LidarScan, WheelPose
 LidarRecord = LidarScan | WheelPose | ImuReading
 
 _MOST_WALL_POINTS = 400_000
+_LEAST_LAG_S = 0.005  # An age of scans that is said.
+
 _LEARNED_SCANS = 600
 _LEARNED_M, _LEARNED_RAD = 6.0, 6.0  # Way and turn after which faults of scanners and wheels are known.
 
@@ -66,11 +68,9 @@ class LidarRun(Run):
     def remarks(self) -> list[str]:
         """What a person should know of the run, a line each."""
         lines = self._odometry.remarks()
-        if lag_s := self._odometry.lag_s:
+        if abs(lag_s := self._odometry.lag_s) >= _LEAST_LAG_S:
             side = "older" if lag_s > 0.0 else "younger"
-            off = f"+- {self._odometry.front_end.lag_deviation_s:.2f} s"
-            line = f"scans are {abs(lag_s):.2f} s {side} than their stamps, by the wheels' clock ({off}): corrected"
-            lines.append(line)
+            lines.append(f"scans are {abs(lag_s):.2f} s {side} than their stamps, by the wheels' clock: corrected")
         if yaw := math.degrees(self._odometry.mounting_yaw_rad):
             side = "left" if yaw > 0.0 else "right"
             lines.append(

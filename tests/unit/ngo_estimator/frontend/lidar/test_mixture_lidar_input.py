@@ -12,7 +12,6 @@ from hypothesis import strategies as st
 
 from ngo_estimator.data.relative_step import RelativeStep, check_step
 from ngo_estimator.frontend.lidar.mixture_lidar import MixtureLidar
-from ngo_estimator.frontend.lidar.stamped_wheels import StampedWheels
 from ngo_estimator.frontend.rejected_frames import DuplicateFrame, LateFrame, UnusableImage
 from ngo_estimator.geometry.planar_motion import between, compose
 from ngo_recordings.scan_stream import LidarScan, WheelPose
@@ -181,20 +180,6 @@ def test_the_first_scan_is_deskewed_by_the_wheels() -> None:
     steps = fed(MixtureLidar(), [record for pair in zip(wheels(poses), swept, strict=False) for record in pair])
     errors = [between(between(poses[0], p), step.odom_xyyaw) for p, step in zip(poses[1:], steps, strict=False)]
     assert len(steps) == 11 and np.abs(errors).max() < 0.01
-
-
-def test_the_turn_that_tells_the_lag_holds_nothing_of_the_wheels(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Wheels that are 0.07 s late bend each scan as the robot's turn changes; else they would say that they are not."""
-    poses, _, swept = swept_scans([0.0] * 5 + [math.radians(5.0 if k // 6 % 2 else -5.0) for k in range(40)])
-    times, yaws = 1e3 + 0.1 * np.arange(len(poses)), np.unwrap(poses[:, 2])
-    errors = []
-
-    def observe(self: StampedWheels, from_s: float, to_s: float, turn_rad: float) -> None:
-        errors.append(turn_rad - float(np.interp(to_s, times, yaws) - np.interp(from_s, times, yaws)))
-
-    monkeypatch.setattr(StampedWheels, "observe_turn", observe)
-    fed(MixtureLidar(), [record for pair in zip(wheels(poses, 70_000_000), swept, strict=False) for record in pair])
-    assert len(errors) > 30 and np.abs(errors).max() < 0.02
 
 
 def errors_of_slipping_wheels(poses: np.ndarray, scans: list[LidarScan], slips_rad: list[float]) -> np.ndarray:

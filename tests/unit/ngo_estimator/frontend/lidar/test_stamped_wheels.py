@@ -59,23 +59,6 @@ def test_the_lag_is_learned_from_turns() -> None:
     assert wheels.lag_s == pytest.approx(0.1, abs=0.01)
 
 
-@pytest.mark.parametrize("seed", range(4))
-def test_a_few_turns_tell_a_lag_and_how_far_it_may_be_off(seed: int) -> None:
-    noise, wheels, errors = np.random.default_rng(seed), StampedWheels(), []
-    yaw = lambda at_s: 0.8 * np.sin(1.3 * at_s)  # noqa: E731
-    drift = np.cumsum(noise.normal(0.0, 0.01, 150))
-    for k in range(150):
-        if 20 < k < 40:  # a pause of the wheels, in which the robot turned on
-            continue
-        wheels.add(round(0.1e9 * k), np.array((0.0, 0.0, yaw(0.1 * k) + drift[k])))
-        if k > 10:
-            wheels.observe_turn(0.1 * k - 0.1, 0.1 * k, float(yaw(0.1 * k - 0.14) - yaw(0.1 * k - 0.24)))
-        if k > 70:
-            errors.append((wheels.lag_s - 0.14) / wheels.lag_deviation_s)
-    assert np.abs(errors).max() < 3.0
-    assert wheels.lag_deviation_s < 0.03
-
-
 @pytest.mark.parametrize("apart_ms", [0, 30])
 def test_noise_of_the_wheels_makes_no_lag(apart_ms: int) -> None:
     """Between two readings their noise averages out; a lag of half a period must seem no better for it."""

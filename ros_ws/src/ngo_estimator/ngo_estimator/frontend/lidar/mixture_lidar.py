@@ -75,8 +75,6 @@ class MixtureLidar:
         self._last_s: float | None = None
         self._even_s = 0.0
         self._twist = np.zeros(3)
-        self._sweeps: dict[KeyScan, Sweep] = {}  # that were removed from what may be the next scan
-        self._middle = 0.0, 0.0
         self._robot_odom: Array | None = None
 
     @property
@@ -93,11 +91,6 @@ class MixtureLidar:
     def lag_s(self) -> float:
         """How much older the scans are than their stamps (s), by the wheels' clock; 0 until it is known."""
         return 0.0 if self._wheels is None else self._wheels.lag_s
-
-    @property
-    def lag_deviation_s(self) -> float:
-        """How far the lag may be off (s): one deviation."""
-        return math.inf if self._wheels is None else self._wheels.lag_deviation_s
 
     @property
     def mounting_yaw_rad(self) -> float:
@@ -193,10 +186,9 @@ class MixtureLidar:
 
     def _step(self, scan: LidarScan, at_s: float) -> RelativeStep | None:
         last_s, wheels, calibration = self._last_s, self._wheels, self._core.mixture.calibration
-        self._sweeps.clear()
         if last_s is None:
             self._core.begin(self._key_scan(scan, None if wheels is None else self._sweep(scan, at_s, math.inf)))
-            self._last_s, self._middle = at_s, self._swept_middle()
+            self._last_s = at_s
             return None
         gap_s = at_s - last_s
         by_wheels = None if wheels is None else wheels.motion(last_s, at_s, calibration)
@@ -209,10 +201,8 @@ class MixtureLidar:
             silent = bool((wheels.gaps(last_s, at_s, longest_s)[1] > longest_s).any())
         step = self._core.update(self._key_scan(scan, sweep), by_wheels, counted, gap, silent, again)
         self._last_s, self._twist = at_s, arc_velocity(step.relative_xyyaw, max(gap_s, 1e-3))
-        (begin_s, begin_rad), self._middle = self._middle, self._swept_middle()
         if wheels is not None and not step.unsure:
-            turn_rad = float(step.relative_xyyaw[2]) + self._middle[1] - begin_rad
-            wheels.observe_turn(last_s + begin_s, at_s + self._middle[0], turn_rad)
+            wheels.observe_turn(last_s, at_s, float(step.relative_xyyaw[2]))
         pose = None if wheels is None else wheels.pose_at(at_s)
         if pose is None and self._robot_odom is not None:
             pose = compose(self._robot_odom, step.relative_xyyaw)
@@ -230,20 +220,7 @@ class MixtureLidar:
             raise UnusableImage(str(error)) from error
         if len(key.points) < _LEAST_POINTS:
             raise UnusableImage(f"the scan has {len(key.points)} usable returns; expected at least {_LEAST_POINTS}")
-        if sweep is not None:
-            self._sweeps[key] = sweep
         return key
-
-    def _swept_middle(self) -> tuple[float, float]:
-        """The middle of the last scan's sweep after its stamp (s), and the turn until then that was removed (rad).
-
-        A match puts the middle where it was, whatever motion was removed. Until there the turn is that motion's.
-        """
-        sweep = self._sweeps.get(self._core.taken)
-        if sweep is None:
-            return 0.0, 0.0
-        middle_s = _middle_s(sweep)
-        return middle_s, middle_s * float(sweep.twist[2])
 
     def _sweep(self, scan: LidarScan, at_s: float, gap_s: float) -> Sweep | None:
         """How the robot moves during the scan, where the scan says how long it takes."""
@@ -262,7 +239,7 @@ class MixtureLidar:
 
         Points that were moved by another velocity lie off by its error until the sweep's middle, and so does the step.
         """
-        middle_s = _middle_s(sweep)
+        middle_s = 0.5 * float(sweep.offsets_s.min() + sweep.offsets_s.max())
         twist = (arc_velocity(step, 1.0) + middle_s * sweep.twist) / (gap_s + middle_s)
         off = np.abs(middle_s * (twist - sweep.twist))
         if max(off[0], off[1]) < _SWEPT_M and off[2] < _SWEPT_RAD:
@@ -273,7 +250,3 @@ class MixtureLidar:
 def _duration_s(scan: LidarScan) -> float:
     """How long the sweep lasts (s); 0 where the scan does not say it, or says what cannot be."""
     return scan.sweep_s if scan.sweep_s <= _LONGEST_SWEEP_S else 0.0
-
-
-def _middle_s(sweep: Sweep) -> float:
-    return 0.5 * float(sweep.offsets_s.min() + sweep.offsets_s.max())

@@ -98,7 +98,6 @@ class MixtureOdometry:
     def begin(self, scan: KeyScan) -> None:
         """Take the first scan, which is a key scan at the origin."""
         self._submap.add(scan, self._pose)
-        self.taken = scan  # the last one, as its sweep was removed
         self._origin: KeyScan | None = scan
         self._origin_ns = self._last_ns = self._key_ns = scan.stamp_ns
 
@@ -201,7 +200,7 @@ class MixtureOdometry:
             origin_scan=self._origin,
             segment=segment,
         )
-        self._last_ns, self._origin, self.taken = scan.stamp_ns, None, scan
+        self._last_ns, self._origin = scan.stamp_ns, None
         return step
 
     def _prior(self, walls: Array | None, wide: bool = False) -> Mixture:

@@ -12,27 +12,20 @@ _KEPT = 1024
 _EXTRAPOLATED_S = 0.5
 """Wheels whose last pose is older are silent."""
 
-_LAGS_S, _STEP_S = np.linspace(-0.48, 0.48, 49, retstep=True)
-_USUAL_S = 0.1
-"""Deviation of the lags of robots, before anything is known."""
-
+_LAGS_S = np.linspace(-0.48, 0.48, 49)
+_NONE = int(np.abs(_LAGS_S).argmin())
 _REMEMBERED = 0.998
 """What a turn counts after the next one."""
+
+_LEAST_TURNS = 60.0
+"""Turns after which the lag counts."""
 
 _TURNS_RAD = 0.02
 """A smaller turn between two scans tells no lag."""
 
-_PAUSE = 3.0
-"""Usual gaps between readings in a pause of the wheels, which a spline would bend into the time around it."""
-
-_FIRST_TURNS = 5.0
-"""As many turns that are off by `_TURNS_RAD` at any lag are taken for seen: a few that fit by chance tell little."""
-
-_ALONE = 0.4
-"""What a turn tells beside its neighbours, whose errors are alike."""
-
-_SURE = 3.0
-"""A lag that is not so many deviations from none stays away."""
+_BETTER, _SURE, _OF_TURNS = 0.9, 1.5, 0.6
+"""The lag must leave so much of what no lag leaves, less by so many deviations, and so much of all turns: the rest is
+the wheels' noise."""
 
 
 class StampedWheels:
@@ -45,11 +38,10 @@ class StampedWheels:
         self._origin_ns = 0
         self._period = UsualPeriod()
         self._pending: list[tuple[float, float, float]] = []
-        self._off, self._turns = np.full(len(_LAGS_S), _FIRST_TURNS * _TURNS_RAD), _FIRST_TURNS
+        self._off, self._squares = np.zeros((2, len(_LAGS_S)))  # sums, and squared differences from no lag
+        self._turns = self._turned = 0.0
         self.lag_s = 0.0
         """How much older scans are than their stamps (s); 0 until it is known."""
-        self.lag_deviation_s = _USUAL_S
-        """How far the lag may be off (s): one deviation."""
 
     @property
     def newest_ns(self) -> int:
@@ -106,7 +98,7 @@ class StampedWheels:
         return lengths[long], inside[long]
 
     def observe_turn(self, from_s: float, to_s: float, turn_rad: float) -> None:
-        """Take how far the robot turned between two times at which a scanner saw it, by a match, to learn the lag."""
+        """Take how far the robot turned between two scans, by a match, to learn the lag."""
         self._pending.append((from_s - self._origin_ns * 1e-9, to_s - self._origin_ns * 1e-9, turn_rad))
         rows = self._rows[: self._count]
         while self._pending and self._pending[0][1] + _LAGS_S[-1] < self._newest_s:
@@ -114,22 +106,29 @@ class StampedWheels:
             if start + _LAGS_S[0] < rows[0, 0]:
                 continue
             by_wheels = _turns(rows, start, end)
-            if np.isnan(by_wheels[0]) or max(abs(turn), by_wheels.max(), -by_wheels.min()) < _TURNS_RAD:
+            if max(abs(turn), by_wheels.max(), -by_wheels.min()) < _TURNS_RAD:
                 continue
-            self._off = _REMEMBERED * self._off + np.minimum(np.abs(by_wheels - turn), 10.0 * _TURNS_RAD)
+            off = np.minimum(np.abs(by_wheels - turn), 10.0 * _TURNS_RAD)
+            self._off = _REMEMBERED * self._off + off
+            self._squares = _REMEMBERED**2 * self._squares + (off - off[_NONE]) ** 2
+            self._turned = _REMEMBERED * self._turned + abs(turn)
             self._turns = _REMEMBERED * self._turns + 1.0
-            self._learn()
         if len(self._pending) > _KEPT:
             self._pending.pop(0)
+        if self._turns > _LEAST_TURNS:
+            self.lag_s = self._learned()
 
-    def _learn(self) -> None:
-        """The mean lag and its deviation, by how far turns are off at each: their errors are Laplace's."""
-        log = -_ALONE * self._turns * np.log(self._off) - 0.5 * (_LAGS_S / _USUAL_S) ** 2
-        odds = np.exp(log - log.max())
-        odds /= odds.sum()
-        mean = float(odds @ _LAGS_S)
-        self.lag_deviation_s = math.sqrt(float(odds @ (_LAGS_S - mean) ** 2) + _STEP_S**2 / 12.0)
-        self.lag_s = mean if abs(mean) > _SURE * self.lag_deviation_s else 0.0
+    def _learned(self) -> float:
+        best = int(self._off.argmin())
+        if best == _NONE or not 0 < best < len(_LAGS_S) - 1:
+            return 0.0
+        most = self._off[_NONE] - _SURE * math.sqrt(self._squares[best])
+        if self._off[best] > min(_BETTER * self._off[_NONE], most, _OF_TURNS * self._turned):
+            return self.lag_s
+        left, here, right = self._off[best - 1 : best + 2]
+        bend = left - 2.0 * here + right
+        shift = 0.5 * (left - right) / bend if bend > 0.0 else 0.0
+        return float(_LAGS_S[best] + shift * (_LAGS_S[1] - _LAGS_S[0]))
 
 
 def _known(found: Array) -> Array | None:
@@ -151,39 +150,29 @@ def _pose_at(rows: Array, at: float) -> Array:
 
 @njit(cache=True)
 def _turns(rows: Array, start_s: float, end_s: float) -> Array:
-    """How far the wheels turned between two times, at each lag; no number beside a pause of theirs.
+    """How far the wheels turned between two times, at each lag.
 
-    A spline of degree 5 has the same noise at and between readings, to half a percent. Straight lines have 0.7 times as
-    much between them, so that noise alone would make a lag of half a period; a cubic spline has 0.96 times as much.
+    A cubic B-spline has nearly the same noise at and between readings. Straight lines have less between them, so that
+    noise alone would make a lag of half a period.
     """
-    first = np.searchsorted(rows[:, 0], start_s - _LAGS_S[-1]) - 3
-    last = np.searchsorted(rows[:, 0], end_s - _LAGS_S[0]) + 3
+    first = np.searchsorted(rows[:, 0], start_s - _LAGS_S[-1]) - 2
+    last = np.searchsorted(rows[:, 0], end_s - _LAGS_S[0]) + 2
     near = rows[max(first, 0) : last]
     times, yaws = near[:, 0].copy(), near[:, 3].copy()
-    gaps = np.diff(times)
-    if gaps.max() > _PAUSE * np.median(gaps):
-        return np.full(len(_LAGS_S), np.nan)
     result: Array = _smooth(times, yaws, end_s - _LAGS_S) - _smooth(times, yaws, start_s - _LAGS_S)
     return result
 
 
 @njit(cache=True)
 def _smooth(times: Array, values: Array, at: Array) -> Array:
-    """A B-spline of degree 5 of ``values`` ``(n,)`` at some times ``(k,)``."""
+    """A cubic B-spline of ``values`` ``(n,)`` at some times ``(k,)``."""
     places = np.interp(at, times, np.arange(len(times)).astype(np.float64))
-    result = np.zeros(len(at))
+    result = np.empty(len(at))
     for k in range(len(at)):
         i = min(int(places[k]), len(values) - 2)
-        s, weights = places[k] - i, np.zeros(6)
-        weights[0] = 1.0
-        for degree in range(1, 6):
-            carried = 0.0
-            for j in range(degree):
-                share = weights[j] / degree
-                weights[j], carried = carried + (j + 1.0 - s) * share, (s + degree - 1.0 - j) * share
-            weights[degree] = carried
-        for j in range(6):
-            result[k] += weights[j] * values[min(max(i + j - 2, 0), len(values) - 1)]
+        s = places[k] - i
+        weights = (1.0 - s) ** 3, 3.0 * s**3 - 6.0 * s**2 + 4.0, 3.0 * s * (1.0 + s - s**2) + 1.0, s**3
+        result[k] = sum([weights[j] / 6.0 * values[min(max(i + j - 1, 0), len(values) - 1)] for j in range(4)])
     return result
 
 
