@@ -103,18 +103,19 @@ def year_numbers(years: Sequence[Measured]) -> dict[str, Numbers]:
 def year_ratios(years: Sequence[Measured]) -> Numbers:
     """Numbers of the last ten drives as a share of what they are compared with, one of each year; none of a year in
     which both are the same drives. ``of_alone``: of the error of each drive, that of the same drive alone."""
-    last, found = _ROWS["last_ten"], {}
+    last, pairs = _ROWS["last_ten"], {}
     second, first = "eleven_to_twenty", "first_ten"
     for key, row in (("memory_mb", second), ("ms_a_scan", second), ("ate_m", first), ("drive_ate_m", first)):
         before = _ROWS[row]
-        both = [
+        pairs[key] = [
             (_of([year], key, last), _of([year], key, before))
             for year in years
             if len(year.errors[key]) >= 10 + (before.stop or 0)
         ]
-        found[key] = np.array([a.mean() / b.mean() for a, b in both if len(a) and len(b)])
-    two = [[_of([year], key, last).mean() for key in ("drive_ate_m", "alone_ate_m")] for year in years]
-    return intervals(found | {"of_alone": np.array([own / alone for own, alone in two])})
+    pairs["of_alone"] = [(_of([year], "drive_ate_m", last), _of([year], "alone_ate_m", last)) for year in years]
+    return intervals(
+        {key: np.array([a.mean() / b.mean() for a, b in both if len(a) and len(b)]) for key, both in pairs.items()}
+    )
 
 
 def year_least(years: Sequence[Measured]) -> dict[str, float]:

@@ -59,6 +59,14 @@ def test_the_table_has_ten_drives_a_row_and_keeps_what_is_not_measured(
     assert page.count("| last ten | 24.5 ") == 2 and "after any drive is 0.500." in page
 
 
+def test_a_year_whose_last_drives_never_found_the_robot_has_no_ratio_of_errors() -> None:
+    found, lost = a_year(30), a_year(30)
+    for key in ("ate_m", "drive_ate_m", "alone_ate_m"):
+        lost.errors[key][-10:] = np.nan
+    both, one = (year_rows.year_ratios(years) for years in ([found, lost], [found]))
+    assert all(both[key] == one[key] for key in ("ate_m", "drive_ate_m", "of_alone"))
+
+
 def test_a_year_goes_on_from_what_is_on_disk(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(year_rows, "MOST_SCANS", 100)
     year = Year(12_001, 1, 400, 1, 4000, WEIGHTS / "scan", tmp_path)
