@@ -73,7 +73,8 @@ def page(result: dict[str, Any]) -> str:
                 np.divide(*(np.mean([cell[row][key]["mean"] for cell in both]) for row in ("robust", "gtsam_gnc")))
                 for key in ("ate_m", "seconds")
             )
-            parts.append(f"`robust` has {error:.2f} of the error of GNC in each block, in {seconds:.3f} of its time.\n")
+            share = f"{error:.2f} of the error of GNC in the mean over the blocks, in {seconds:.3f} of its time"
+            parts.append(f"`robust` has {share}.\n")
         if graph in result.get("pictures", {}):
             name, cell = result["pictures"][graph]
             parts.append(f"`{cell}`: {CAPTION}\n\n![Verdicts about the loops of {graph} as they come](images/{name})\n")
