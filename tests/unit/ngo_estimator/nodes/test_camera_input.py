@@ -57,10 +57,10 @@ class Robot:
         message.k = np.array((focal, 0.0, 80.0, 0.0, focal, 60.0, 0.0, 0.0, 1.0))
         self._topics["/camera/camera_info"](message)
 
-    def mount(self, frame: str, parent: str, height_m: float) -> None:
+    def mount(self, frame: str, parent: str, height_m: float, topic: str = "/tf_static") -> None:
         each = TransformStamped(child_frame_id=frame)
         each.header.frame_id, each.transform.translation.z, each.transform.rotation.w = parent, height_m, 1.0
-        self._topics["/tf_static"](TFMessage(transforms=[each]))
+        self._topics[topic](TFMessage(transforms=[each]))
 
     def see(self, stamp_s: float, wheels_s: float | None = None) -> None:
         wheels, picture = Odometry(), Image(width=160, height=120, encoding="mono8", step=160, data=bytes(160 * 120))
@@ -106,7 +106,7 @@ def test_without_odometry_the_height_over_the_floor_gives_the_scale_or_there_is_
     robot = Robot("none")
     robot.calibrate(100.0)
     robot.see(1.0)
-    assert "no odometry of the robot, and the camera is 0 m over the robot's frame" in robot.dropped[-1]
+    assert "no transform says how high the camera is over the floor (found 0 m;" in robot.dropped[-1]
     for frame, parent, height_m in (("base_link", "base_footprint", 0.3), ("camera", "base_link", 0.2)):
         robot.mount(frame, parent, height_m)
     robot.calibrate(100.0, "camera")
@@ -116,3 +116,37 @@ def test_without_odometry_the_height_over_the_floor_gives_the_scale_or_there_is_
     assert "1 pictures showed too little of the floor: they have the scale of those before them, or none" in (
         robot.input.problems()
     )
+
+
+@pytest.mark.parametrize(("frame", "height_m"), [("base_link", 0.3), ("camera", 0.5)])
+@pytest.mark.parametrize("late", [False, True])
+def test_the_floor_is_at_base_footprint_whatever_comes_above_base_link(frame: str, height_m: float, late: bool) -> None:
+    robot = Robot("none")
+
+    def see(stamp_s: float) -> None:
+        robot.calibrate(100.0, frame)
+        robot.see(stamp_s)
+
+    robot.mount("camera", "base_link", 0.2)
+    if late:
+        see(1.0)
+    robot.mount("base_link", "base_footprint", 0.3)
+    see(1.1)
+    robot.mount("base_link", "odom", 0.0, "/tf")
+    robot.calibrate(120.0, frame)
+    see(1.2)
+    core = robot.input._core
+    assert core is not None and core.model.centre[2] == pytest.approx(height_m)
+    assert ("the camera's mounting came late" in "".join(robot.said)) == (late and frame == "camera")
+    problems = robot.input.problems()
+    assert not any("robot_odometry:=tf" in line for line in problems)
+    assert any("set base_frame:=base_footprint" in line for line in problems)
+
+
+def test_odometry_on_tf_that_is_not_used_is_a_problem() -> None:
+    robot = Robot("none")
+    robot.mount("camera", "base_link", 0.2)
+    robot.mount("base_link", "odom", 0.0, "/tf")
+    robot.calibrate(100.0, "camera")
+    robot.see(1.0)
+    assert "'odom' -> 'base_link' is on TF already: robot_odometry:=tf uses it" in robot.input.problems()

@@ -133,7 +133,7 @@ def test_a_clock_that_is_wrong_is_said_in_one_line() -> None:
     [
         (False, True, 160, "camera", "no CameraInfo is on /camera/camera_info"),
         (False, True, 160, None, "no CameraInfo with pictures"),
-        (True, False, 160, None, "no odometry of the robot, and the camera is 0 m over the robot's frame; expected"),
+        (True, False, 160, None, "no transform says how high the camera is over the floor .found 0 m; expected"),
         (True, True, 80, None, "pictures are 80 x 60; expected a width of 160 or more"),
     ],
 )
@@ -144,6 +144,18 @@ def test_what_is_missing_is_said_in_one_line(
     recording(tmp_path / "drive.mcap", 2, model, camera_info(model) if info else None, wheels, mounted=wheels)
     with pytest.raises(ValueError, match=complaint):
         run(Arguments((tmp_path / "drive.mcap",), tmp_path / "out", world=world), Console(quiet=True))
+
+
+@pytest.mark.parametrize("wheels", [None, "none"])
+def test_odometry_that_is_to_be_named_is_said(tmp_path: Path, wheels: str | None) -> None:
+    model, console = camera(160), Console(record=True, width=200)
+    recording(tmp_path / "drive.mcap", 2, model, camera_info(model), wheels=False, mounted=False)
+    twist = m.make("geometry_msgs/msg/TwistStamped", m.header(BEGIN_NS, "base_link"), m.twist(1.0, 0.0, 0.0))
+    m.write_mcap(tmp_path / "more.mcap", [("/encoders", BEGIN_NS, twist)])
+    paths = tmp_path / "drive.mcap", tmp_path / "more.mcap"
+    with pytest.raises(ValueError, match="no transform says how high"):
+        run(Arguments(paths, tmp_path / "out", topics=TopicArguments(wheels=wheels)), console)
+    assert ("if it is /encoders, --wheels names it" in console.export_text()) == (wheels is None)
 
 
 def test_a_camera_that_nobody_calibrated_is_refused(tmp_path: Path) -> None:

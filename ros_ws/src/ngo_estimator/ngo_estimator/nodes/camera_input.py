@@ -29,6 +29,7 @@ from ngo_recordings.poses import Pose
 
 _MOUNTING_WAIT_NS = 2_000_000_000
 _MOST_HELD, _MOST_GIVEN, _DEPTH = 64, 1000, 10
+_SAME_HEIGHT_M = 0.001
 
 
 class CameraInput:
@@ -53,6 +54,7 @@ class CameraInput:
         self._picture_frame = ""
         self._core: PictureOdometry | None = None
         self._mounted = False  # as transforms say
+        self._unused: bool | None = None  # odometry of the robot was on TF before ours, which has the same frames
         self._held: deque[tuple[int, np.ndarray]] = deque(maxlen=_MOST_HELD)
         self._given: deque[tuple[int, np.ndarray]] = deque(maxlen=_MOST_GIVEN)  # odometry before there is a core
         self._restarts = self._newly_alone = self._unplaced = self._jumps = 0
@@ -103,8 +105,11 @@ class CameraInput:
         self._node.get_logger().warning(f"{why}: the odometry starts anew with it")
 
     def _on_transforms(self, static: bool) -> None:
-        if self._core is not None and not self._mounted and self._mounting() is not None:
-            self._begin_anew("the camera's mounting came late")
+        may_be_late = not self._mounted or (self._by_floor and static)
+        if self._core is not None and may_be_late and (mounting := self._mounting()) is not None:
+            rise_m = abs(mounting.position[2] - self._core.model.centre[2])
+            if not self._mounted or rise_m > _SAME_HEIGHT_M:
+                self._begin_anew("the camera's mounting came late")
         self._update()
 
     def _add_wheels(self, stamp_ns: int, pose_xyyaw: np.ndarray) -> None:
@@ -161,6 +166,10 @@ class CameraInput:
         waited_ns = self._held[-1][0] - self._held[0][0]
         if mounting is None and waited_ns < _MOUNTING_WAIT_NS and len(self._held) < _MOST_HELD:
             return False
+        if self._unused is None:
+            self._unused = self._by_floor and self._robot.odom_frame in self._robot.transforms.above(
+                self._robot.base_frame
+            )
         frame, logger = self._frame, self._node.get_logger()
         if mounting is None:
             logger.warning(
@@ -190,13 +199,14 @@ class CameraInput:
         return (self._calibration.frame_id if self._calibration is not None else "") or self._picture_frame
 
     def _mounting(self) -> Pose | None:
+        # Of the floor static transforms alone tell: on TF our own odometry becomes the parent of the robot's frame.
+        if self._by_floor:
+            over_floor = self._robot.fixed.newest_lookup(self._settings.framed(FLOOR_FRAME), self._frame)
+            if over_floor is not None:
+                return over_floor
         if self._frame == self._robot.base_frame:
             return Pose(np.zeros(3), Rotation.identity())
-        lookup = self._robot.transforms.newest_lookup
-        found = lookup(self._robot.base_frame, self._frame) if self._frame else None
-        if not self._by_floor or found is None:
-            return found
-        return lookup(self._settings.framed(FLOOR_FRAME), self._frame) or found
+        return self._robot.transforms.newest_lookup(self._robot.base_frame, self._frame) if self._frame else None
 
     def reset(self) -> str:
         """Start anew with the next picture; returns what that means, in words."""
@@ -238,4 +248,10 @@ class CameraInput:
             found.append("no odometry of the robot came yet")
         if self._core is not None and not self._mounted:
             found.append(f"no transform says where the camera sits on '{self._robot.base_frame}'")
+        base, odom = self._robot.base_frame, self._robot.odom_frame
+        if self._unused:
+            found.append(f"'{odom}' -> '{base}' is on TF already: robot_odometry:=tf uses it")
+        below_floor = self._settings.framed(FLOOR_FRAME) in self._robot.fixed.above(base)[1:]
+        if below_floor and self._settings.robot_odometry != "tf" and self._settings.publish_tf:
+            found.append(f"'{odom}' -> '{base}' is a second parent of '{base}': set base_frame:={FLOOR_FRAME}")
         return found

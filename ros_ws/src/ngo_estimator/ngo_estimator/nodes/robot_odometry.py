@@ -40,7 +40,7 @@ class RobotOdometry:
         self._take, self._on_transforms, self._on_odometry = take, on_transforms, on_odometry
         self.base_frame = settings.framed(settings.base_frame)
         self.odom_frame = settings.framed(settings.odom_frame)
-        self.transforms = TransformBuffer()
+        self.transforms, self.fixed = TransformBuffer(), TransformBuffer()  # all, and those of /tf_static alone
         self._wheels = FramePoses(self.transforms, self.odom_frame, self.base_frame)
         self._poses = OdometryPoses()
 
@@ -72,6 +72,7 @@ class RobotOdometry:
             self._status.dropped("robot odometry", error)
 
     def _read_static(self, message: TFMessage) -> None:
+        self.fixed.take(message.transforms, static=True)
         self._read_transforms(message, static=True)
 
     def _read_moving(self, message: TFMessage) -> None:

@@ -335,6 +335,7 @@ def _camera(arguments: Arguments, recording: Recording, console: Console) -> "St
     from ngo_recordings.frames import frames as frames_of
     from ngo_recordings.mounting import FLOOR_FRAME, find_pose
     from ngo_recordings.scan_stream import wheel_poses
+    from ngo_recordings.topics import wheel_topics_to_name, wheel_transforms
 
     cv2.setNumThreads(1)
     topics = choose_topics(recording, replace(arguments.topics, action="none", twist="none"), with_wheels=True)
@@ -354,14 +355,19 @@ def _camera(arguments: Arguments, recording: Recording, console: Console) -> "St
         seen = replace(seen, frame_id=frame)
         where = f"{frame} in {base} at {', '.join(f'{value:.3f}' for value in pose.position)} m (from {source})"
     model = calibrated_camera(seen, pose)
+    if by_floor and not topics.no_wheels:
+        sources = wheel_topics_to_name(recording, topics.image, topics.ground_truth)
+        sources += map(str, wheel_transforms(recording, topics.image, topics.ground_truth))
+        if sources:
+            console.print(f"no odometry is used; if it is {' or '.join(sources)}, --wheels names it")
     odometry = PictureOdometry(model, by_floor=by_floor)
     used = f"using {_words(topics)}, calibration {info}"
     console.print("; ".join((used, *recording.notes)))
     console.print(f"camera: {seen.width} x {seen.height}, {model.description}; {where}")
     if by_floor:
         console.print(
-            f"no odometry of the robot was found (name it: --wheels): the scale comes from the camera's height of "
-            f"{model.centre[2]:.3f} m over the floor, where the floor is seen"
+            f"the scale comes from the camera's height of {model.centre[2]:.3f} m over the floor, "
+            "where the floor is seen"
         )
     core = CameraRun(odometry, PictureTrajectory(iterations_per_step=arguments.iterations_per_step))
     wheels = () if by_floor else wheel_poses(recording, topics, core.rejected)
