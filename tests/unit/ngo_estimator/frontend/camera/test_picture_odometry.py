@@ -153,3 +153,14 @@ def test_the_floor_tells_the_scale_and_where_it_is_not_seen_nobody_is_sure_of_th
         std_m = math.sqrt(sum(step.covariance[0, 0] for step in steps))
         assert off_m < 3.0 * std_m
         assert off_m < 0.05 and std_m < 0.1 if floor else std_m > 0.2
+
+
+def test_a_robot_that_stood_while_pictures_paused_stays_where_it_was() -> None:
+    model, truth = camera(320), drive(8)
+    rays, steps, odometry = rays_of(model), list[RelativeStep](), PictureOdometry(model, by_floor=True)
+    for k, pose in enumerate((*truth, truth[-1])):
+        stamp_ns = k * PERIOD_NS + (30_000_000_000 if k == len(truth) else 0)
+        odometry.add_picture(stamp_ns, picture(model, rays, pose))
+        steps += odometry.ready()
+    assert odometry.inliers > 20 and np.abs(steps[-2].relative_xyyaw).max() > 0.05
+    assert np.abs(steps[-1].relative_xyyaw).max() < 0.005

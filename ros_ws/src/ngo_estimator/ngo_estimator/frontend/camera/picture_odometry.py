@@ -58,8 +58,8 @@ class PictureOdometry:
         self.model, self._config, self._by_floor = model, config or CameraConfig(), by_floor
         if by_floor and not model.centre[2] >= self._config.least_height_m:
             raise ValueError(
-                f"there is no odometry of the robot, and the camera is {model.centre[2]:g} m over the robot's frame; "
-                f"expected the one, or {self._config.least_height_m:g} m or more by its transform: the scale comes "
+                "there is no odometry of the robot, and no transform says how high the camera is over the floor "
+                f"(found {model.centre[2]:g} m; expected {self._config.least_height_m:g} m or more): the scale comes "
                 "from either"
             )
         self._describer = describer or Sift(self._config.features)
@@ -196,7 +196,7 @@ class PictureOdometry:
     def _motion(self, last_ns: int | None, stamp_ns: int, given: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """The motion ``(3,)`` to a picture by the wheels, whose pose is ``given`` there, and variances ``(3,)`` of what
         they leave open of it (m, m, rad): the way in a gap between readings, and all of it where their frame jumped, or
-        there are none. Then the velocity goes on."""
+        there are none. Then the velocity goes on, for as long as a robot takes to stop: it may stand after that."""
         motion, config = between(self._given, given), self._config
         if last_ns is None:
             return motion, np.zeros(3)
@@ -207,7 +207,8 @@ class PictureOdometry:
         self.jumps += jumped
         if jumped or self._by_floor:
             open_s2 = (self._blind_s + took_s) ** 2 - self._blind_s**2  # a wrong velocity adds up
-            return self._velocity * took_s, (speed**2 * open_s2)[[0, 0, 1]]
+            goes_on = (took_s <= speed / acceleration)[[0, 0, 1]]
+            return self._velocity * took_s * goes_on, (speed**2 * open_s2)[[0, 0, 1]]
         self._velocity = motion / took_s
         # Between two readings the way strays from the line between them by so much, and by no more than the robot goes;
         # from one reading to the other it does not (a Brownian bridge).
