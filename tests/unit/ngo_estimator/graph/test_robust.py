@@ -153,6 +153,36 @@ def test_a_second_drive_is_joined_where_its_step_knows_nothing() -> None:
     assert worst(solution.poses, true) < worst(problem.poses, true)
 
 
+@pytest.mark.parametrize("seed", [0, 21])
+def test_two_drives_that_wander_are_joined_among_groups_of_wrong_loops(seed: int) -> None:
+    """80 % are wrong. What the step between drives says against loops loses the first, and holds the second."""
+    rng = np.random.default_rng(seed)
+    true, place, heading = np.zeros((500, 3)), np.zeros(2), 0.0
+    for node in range(500):
+        true[node] = *place, heading
+        heading += rng.choice((0.0, 0.0, 0.5, -0.5)) * math.pi if node % 4 == 3 else 0.0
+        ahead = 0.5 * np.array((math.cos(heading), math.sin(heading)))
+        if np.abs(place + ahead).max() > 15.0:
+            heading, ahead = heading + 0.5 * math.pi, ahead[::-1] * (-1.0, 1.0)
+        place = place + ahead
+    deviations = np.tile((0.03, 0.02, 0.006), (499, 1))
+    steps = between(true[:-1], true[1:]) + rng.normal(0.0, deviations)
+    steps[249], deviations[249] = (15.0, -8.0, 2.0), (1e3, 1e3, 1e2)
+    ends = np.stack((np.arange(499), np.arange(1, 500)), axis=1)
+    chain = RelativePoses.of_deviations(ends, steps, deviations)
+    right = KDTree(true[:, :2]).query_pairs(1.0, output_type="ndarray")
+    right = right[np.abs(right[:, 1] - right[:, 0]) > 20]
+    right = right[rng.permutation(len(right))[:200]]
+    wrong = (rng.integers(0, 490, (100, 1, 2)) + np.arange(8)[:, None]).reshape(-1, 2)
+    relative = np.repeat(rng.normal(0.0, 0.3, (100, 3)), 8, axis=0)
+    relative = np.concatenate((between(true[right[:, 0]], true[right[:, 1]]), relative))
+    relative += rng.normal(0.0, LOOP_STD, relative.shape)
+    loops = RelativePoses.of_deviations(np.concatenate((right, wrong)), relative, np.tile(LOOP_STD, (1000, 1)))
+    solution = Robust().correct(GraphProblem(chain_poses(steps), chain, loops, np.ones(1000)))
+    believed = solution.loop_weights > 0.0
+    assert believed[:200].mean() > 0.95 and not believed[200:].any()
+
+
 def test_lanes_that_are_taken_for_their_neighbours_make_up_no_scale() -> None:
     """A lawn mower's loops, 70 % wrong: four of five of these are off by one lane, eight in a row in the same way."""
     rng = np.random.default_rng(2)

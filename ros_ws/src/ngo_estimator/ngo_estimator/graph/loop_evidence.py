@@ -93,13 +93,16 @@ def likeliest_mixture(squared: np.ndarray, logs: np.ndarray, degrees: np.ndarray
     return best[1], best[2]
 
 
-def cycle_odds(chain: ChainUncertainty, loops: RelativePoses, area: float, inlier_ratio: float) -> np.ndarray:
-    """Log odds ``(n,)`` of loops by their cycles with the chain and with each other, from their inlier ratio on."""
+def cycle_odds(
+    chain: ChainUncertainty, loops: RelativePoses, area: float, inlier_ratio: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """Log odds ``(n,)`` of loops by their cycles with the chain and with each other, from their inlier ratio on.
+
+    The second ones are those where a chain that says no more than "on the map", as behind a step that nobody measured,
+    speaks against no whole relative pose.
+    """
     squared, logs = chain.off_chain(loops)
     whole = loops.degrees == 3
-    # A chain that says no more than "on the map", as behind a step that nobody measured, speaks against no whole pose.
-    least = likelihood_ratio(np.zeros(len(loops)), logs, loops.degrees, area)
-    logs[whole] += 2.0 * np.minimum(least[whole], 0.0)
     odds = likelihood_ratio(squared, logs, loops.degrees, area)
     odds += math.log(inlier_ratio / (1.0 - inlier_ratio))
     for rows in (np.flatnonzero(whole), np.flatnonzero(~whole)):
@@ -107,7 +110,8 @@ def cycle_odds(chain: ChainUncertainty, loops: RelativePoses, area: float, inlie
             pairs = _nearest(loops.nodes[rows], _PARTNERS + 1)
             pairs = pairs[pairs[:, 0] != pairs[:, 1]]
             odds[rows] += np.minimum(_support(chain, loops[rows], pairs, area, inlier_ratio), _MOST_SUPPORT)
-    return odds
+    least = likelihood_ratio(np.zeros(len(loops)), logs, loops.degrees, area)
+    return odds, odds - np.where(whole, np.minimum(least, 0.0), 0.0)
 
 
 def agreement(chain: ChainUncertainty, loops: RelativePoses, area: float) -> np.ndarray:

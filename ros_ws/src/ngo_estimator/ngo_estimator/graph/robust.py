@@ -143,9 +143,20 @@ def _searched(
     problem: GraphProblem, scale: float, inlier_ratio: float, report: Progress, least_scale: float
 ) -> CorrectedGraph:
     """The best of the solutions with variances so many times as large as stated."""
+    scaled, area = problem.scaled(scale), map_area(problem.poses)
+    both = cycle_odds(ChainUncertainty(scaled.steps), scaled.loops, area, inlier_ratio)
+    # What an unknown chain says against loops keeps wrong ones out, and right ones that join what lies behind it.
+    chosen = both if ((both[0] > 0.0) != (both[1] > 0.0)).any() else both[:1]
+    solutions = [_searched_by(odds, problem, scale, inlier_ratio, report, least_scale) for odds in chosen]
+    return min(solutions, key=lambda solution: solution.cost)
+
+
+def _searched_by(
+    odds: np.ndarray, problem: GraphProblem, scale: float, inlier_ratio: float, report: Progress, least_scale: float
+) -> CorrectedGraph:
+    """The best of these solutions, from what the cycles say of loops ``(loops,)`` on."""
     area, scaled, metric = map_area(problem.poses), problem.scaled(scale), problem.loops.degrees == 3
     chain = chain_poses(problem.steps.relative, problem.poses[0])
-    odds = cycle_odds(ChainUncertainty(scaled.steps), scaled.loops, area, inlier_ratio)
     begun, solutions, count = replace(scaled, poses=chain), [], np.count_nonzero(odds > 0.0)
     # Of whole relative poses the likeliest are right; of places they are where the chain is short.
     orders = [np.argsort(-odds, kind="stable")]
