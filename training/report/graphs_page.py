@@ -84,13 +84,16 @@ def page(result: dict[str, Any]) -> str:
 def _summary(tables: dict[str, Any]) -> str:
     """A line a graph: ours beside the right loops, and beside the peers cell by cell."""
     lines = []
-    for graph, cells in tables.items():
+    for graph, table in tables.items():
+        cells = [cell for cell in table.values() if "robust" in cell]
+        if not cells:
+            continue
         of = {
-            (row, key): f"{np.mean([cell[row][key]['mean'] for cell in cells.values()]):.3g}"
+            (row, key): f"{np.mean([cell[row][key]['mean'] for cell in cells]):.3g}"
             for row in ("robust", "right_loops")
             for key in ("solved", "ate_m", "seconds")
         }
-        peers = [(cell["robust"], [cell[row] for row in cell if row not in _OWN]) for cell in cells.values()]
+        peers = [(cell["robust"], [cell[row] for row in cell if row not in _OWN]) for cell in cells]
         better = [any(peer["solved"]["mean"] > ours["solved"]["mean"] for peer in them) for ours, them in peers if them]
         lines.append(
             (
