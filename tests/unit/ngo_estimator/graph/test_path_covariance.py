@@ -8,7 +8,7 @@ import pytest
 from ngo_estimator.geometry.planar_covariance import propagate
 from ngo_estimator.geometry.planar_motion import between, compose
 from ngo_estimator.graph.cycle_agreement import ChainUncertainty
-from ngo_estimator.graph.path_covariance import path_covariances
+from ngo_estimator.graph.path_covariance import covariances_of, path_covariances
 from ngo_estimator.graph.place_agreement import place_ratio
 from ngo_estimator.graph.relative_poses import RelativePoses
 
@@ -56,6 +56,13 @@ def test_a_path_may_lead_backwards_and_over_a_loop() -> None:
         expected += moved @ covariance[edge] @ moved.T
     found = path_covariances(poses, edges, covariance, np.array([(3, 6)]))
     np.testing.assert_allclose(found[0], expected, rtol=1e-4, atol=1e-9)
+
+
+def test_where_no_path_may_lead_it_is_infinite() -> None:
+    variance = np.ones(len(STEPS))
+    variance[3] = np.inf
+    found = covariances_of(chained(), CHAIN, spread(len(STEPS)), variance, len(STEPS))
+    assert np.isinf(found[:4]).all() and np.isfinite(found[4:]).all() and not found[-1].any()
 
 
 _VARIANCE = 0.25  # of a place, m^2

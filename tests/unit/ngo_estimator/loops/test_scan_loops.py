@@ -12,7 +12,7 @@ from ngo_estimator.graph.pose_graph import PoseGraph
 from ngo_estimator.loops.key_scan_store import KeyScanStore
 from ngo_estimator.loops.key_scan_views import KeyScanViews
 from ngo_estimator.loops.scan_loop_agreement import with_agreement
-from ngo_estimator.loops.scan_loop_candidates import distance_windows, graph_distances
+from ngo_estimator.loops.scan_loop_candidates import covariance_windows
 from ngo_estimator.loops.scan_loop_finder import ScanLoopFinder
 from ngo_estimator.loops.scan_loops import EVIDENCE, ScanLoops
 from ngo_estimator.loops.scan_settings import ScanGraphConfig, ScanLoopConfig, WindowConfig
@@ -45,21 +45,15 @@ def test_loops_of_one_key_are_no_neighbours() -> None:
     assert not counted.agreeing.any() and not counted.accepted.any()
 
 
-def test_the_graphs_distance_goes_over_loops() -> None:
-    poses = np.array([(float(k), 0.0, 0.0) for k in range(6)])
-    none, loops = np.zeros((0, 2), np.int64), np.array(((0, 4), (0, 4)))
-    np.testing.assert_allclose(graph_distances(poses, none, 5), [5, 4, 3, 2, 1, 0], atol=0.01)
-    poses[4] = (0.0, 0.5, 0.0)
-    np.testing.assert_allclose(
-        graph_distances(poses, loops, 4), [0.5, 1.5, 2.5, math.hypot(3.0, 0.5), 0.0, math.hypot(5.0, 0.5)], atol=0.01
+def test_windows_grow_with_the_covariance_up_to_their_limit() -> None:
+    config = WindowConfig(least_m=0.3, most_m=8.0, least_deg=8.0, most_deg=45.0, deviations=3.0)
+    turned, cos, sin = np.diag((1e-4, 1.0, math.radians(5.0) ** 2)), math.cos(0.7), math.sin(0.7)
+    axes = np.array(((cos, -sin, 0.0), (sin, cos, 0.0), (0.0, 0.0, 1.0)))
+    windows = covariance_windows(
+        config, np.stack((np.zeros((3, 3)), axes @ turned @ axes.T, np.diag((9.0, 0.0, 1.0)), np.full((3, 3), np.inf)))
     )
-
-
-def test_windows_grow_with_distance_up_to_their_limit() -> None:
-    config = WindowConfig(least_m=0.3, share=0.04, most_m=8.0, least_deg=8.0, deg_per_m=0.25, most_deg=45.0)
-    windows = distance_windows(config, np.array((0.0, 100.0, 1000.0)))
-    np.testing.assert_allclose(windows[:, 0], (0.3, 4.3, 8.0))
-    np.testing.assert_allclose(np.degrees(windows[:, 2]), (8.0, 33.0, 45.0))
+    np.testing.assert_allclose(windows[:, 0], (0.3, 3.3, 8.0, np.inf))
+    np.testing.assert_allclose(np.degrees(windows[:, 2]), (8.0, 23.0, 45.0, np.inf))
 
 
 COVARIANCE = np.diag((0.02**2, 0.02**2, 0.005**2))
@@ -142,7 +136,6 @@ def test_wrong_shapes_are_refused() -> None:
         (WindowConfig, "least_deg", 0.0),
         (WindowConfig, "most_m", math.inf),
         (WindowConfig, "most_deg", 200.0),
-        (WindowConfig, "share", -0.1),
         (WindowConfig, "deviations", 0.0),
         (ScanGraphConfig, "keys_between", 0),
         (ScanGraphConfig, "most_scans", 99),

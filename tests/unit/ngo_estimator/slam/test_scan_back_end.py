@@ -8,7 +8,9 @@ import pytest
 from ngo_estimator.data.relative_step import KeyScanStep, RelativeStep
 from ngo_estimator.data.state_arrays import StateError, restore, state_of
 from ngo_estimator.geometry.key_scan import KeyScan, no_scan
+from ngo_estimator.loops.scan_loops import ScanLoops
 from ngo_estimator.loops.scan_settings import ScanGraphConfig
+from ngo_estimator.slam.own_map import OwnMap
 from ngo_estimator.slam.scan_back_end import ScanBackEnd
 from tests.unit.ngo_estimator.loops.buildings import HALLWAY, TWICE, between, scan_at
 
@@ -68,8 +70,13 @@ def test_a_key_scan_has_no_factors_by_default() -> None:
     assert dataclasses.replace(key, factors=np.full(3, 2.0)).factors[0] == 2.0
 
 
-def test_more_loops_must_agree_where_the_robot_may_be_farther_away_than_was_searched() -> None:
-    """The same scans at the same poses: steps that tell little leave room for a place that looks alike."""
+def test_more_loops_must_agree_where_the_robot_may_be_farther_away_than_was_searched(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """The same scans at the same poses: steps that tell little leave room for a place that looks alike.
+
+    There the robot is looked for in its own map, however short its way was.
+    """
     sure, lost = (0.02, 0.02, 0.005), (0.5, 0.5, 0.005)
     random = np.random.default_rng(1)
     scans = [dataclasses.replace(scan_at(HALLWAY, pose, random), stamp_ns=k) for k, pose in enumerate(TWICE)]
@@ -78,6 +85,8 @@ def test_more_loops_must_agree_where_the_robot_may_be_farther_away_than_was_sear
     late, agreeing = first_loop(scans, usual, lost)
     assert at_once < late < len(scans) and agreeing >= usual.agreeing_beyond
     assert first_loop(scans, wary, sure)[0] == at_once
+    assert late < first_loop(scans, wary, lost)[0] < len(scans)
+    monkeypatch.setattr(OwnMap, "look", lambda *_: ScanLoops.none())
     assert first_loop(scans, wary, lost)[0] == len(scans)
 
 

@@ -1,42 +1,26 @@
 """Where to look for loops of a key scan: earlier places near which the robot may be, and how wide to search there."""
 
 import math
-from collections.abc import Sequence
 
 import numpy as np
 
-from ngo_estimator.graph.shortest_paths import shortest_paths
 from ngo_estimator.loops.key_scan_views import KeyScanViews
 from ngo_estimator.loops.scan_settings import ScanLoopConfig, WindowConfig
 
 
-def graph_distances(
-    poses: np.ndarray, loops: np.ndarray, key: int, segments: Sequence[int] | np.ndarray = ()
-) -> np.ndarray:
-    """Length ``(keys,)`` of the shortest path through the graph from a key to each other (m); infinite without one.
+def covariance_windows(config: WindowConfig, covariance: np.ndarray) -> np.ndarray:
+    """Half widths ``(keys, 3)`` of the search (m, m, rad) where the graph has these covariances ``(keys, 3, 3)``.
 
-    The paths lead along the chain of poses ``(keys, 3)``, but not over the steps to the first keys of ``segments``,
-    and over loops ``(e, 2)`` between their keys.
+    They are infinite where a covariance is.
     """
-    chain = np.arange(len(poses) - 1)
-    nodes = np.concatenate((np.stack((chain, chain + 1), axis=1), loops))
-    lengths = np.linalg.norm(poses[nodes[:, 1], :2] - poses[nodes[:, 0], :2], axis=1)
-    begin = np.asarray(segments, np.int64)
-    lengths[begin[begin > 0] - 1] = math.inf
-    # A millimetre more: a loop between keys in one place has a length, too.
-    distances: np.ndarray = shortest_paths(nodes, lengths + 1e-3, len(poses), key)
-    return distances
-
-
-def distance_windows(config: WindowConfig, distances: np.ndarray) -> np.ndarray:
-    """Half widths ``(keys, 3)`` of the search (m, m, rad) after distances through the graph ``(keys,)``.
-
-    They are infinite where the distance is.
-    """
-    metres = np.minimum(config.least_m + config.share * distances, config.most_m)
-    degrees = np.minimum(config.least_deg + config.deg_per_m * distances, config.most_deg)
-    windows = np.stack((metres, metres, np.radians(degrees)), axis=-1)
-    windows[np.isinf(distances)] = math.inf
+    known = np.isfinite(covariance).all(axis=(1, 2))
+    given = np.where(known[:, None, None], covariance, 0.0)
+    deviations = np.sqrt((np.linalg.eigvalsh(given[:, :2, :2])[:, -1], given[:, 2, 2]))
+    most = np.array(((config.most_m,), (math.radians(config.most_deg),)))
+    least = np.array(((config.least_m,), (math.radians(config.least_deg),)))
+    metres, turns = np.minimum(least + config.deviations * deviations, most)
+    windows = np.stack((metres, metres, turns), axis=-1)
+    windows[~known] = math.inf
     return windows
 
 

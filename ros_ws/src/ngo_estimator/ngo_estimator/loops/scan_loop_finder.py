@@ -22,7 +22,7 @@ from ngo_estimator.graph.sparsification import WALLS_M, largest_variances, neede
 from ngo_estimator.loops.key_scan_views import KeyScanViews
 from ngo_estimator.loops.scan_fit import fit
 from ngo_estimator.loops.scan_loop_agreement import with_agreement
-from ngo_estimator.loops.scan_loop_candidates import loop_candidates
+from ngo_estimator.loops.scan_loop_candidates import covariance_windows, loop_candidates
 from ngo_estimator.loops.scan_loops import ScanLoops
 from ngo_estimator.loops.scan_settings import ScanGraphConfig
 from ngo_estimator.loops.scan_submaps import SUBMAP_VARIANCE, ScanSubmaps, around_in_time, laid_together
@@ -139,17 +139,15 @@ class ScanLoopFinder:
         rows = np.concatenate((self.doubted, fresh))
         if len(rows) == 0:
             return rows
-        config, windows = self.config, self.config.windows
-        loops, known = self.loops[rows], self.loops[self.used]
+        config, loops, known = self.config, self.loops[rows], self.loops[self.used]
         covariance = path_covariances(
             graph.poses,
             np.concatenate((graph.edges, known.pairs)),
             np.concatenate((graph.step_covariance, known.covariance)),
             loops.pairs,
         )
-        metres = windows.deviations * np.sqrt(np.linalg.eigvalsh(covariance[:, :2, :2])[:, -1])
-        turn = windows.deviations * np.sqrt(covariance[:, 2, 2])
-        searched = (metres <= windows.most_m) & (turn <= math.radians(windows.most_deg))
+        windows = covariance_windows(config.windows, covariance)
+        searched = (windows[:, 0] < config.windows.most_m) & (windows[:, 2] < math.radians(config.windows.most_deg))
         believed = searched | (loops.agreeing >= config.agreeing_beyond)
         later = loops.pairs[:, 1]
         may_grow = later >= graph.stream_ends[graph.stream_of(later)] - config.loops.neighbour_keys

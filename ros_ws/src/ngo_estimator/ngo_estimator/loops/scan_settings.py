@@ -57,20 +57,17 @@ class ScanLoopConfig:
 class WindowConfig:
     """How far a pose may be from where the graph has it: loops are searched that far."""
 
-    least_m: float = 0.3  # Half width of the window at no distance (m).
-    share: float = 0.04  # What each metre of the distance through the graph adds to it (m/m).
+    least_m: float = 0.3  # Half width of the window where the graph is sure (m).
     most_m: float = 8.0  # Half width at most (m).
-    least_deg: float = 8.0  # Half width in heading at no distance (degrees).
-    deg_per_m: float = 0.25  # What each metre of the distance adds to it (degrees/m).
+    least_deg: float = 8.0  # Half width in heading where the graph is sure (degrees).
     most_deg: float = 45.0  # Half width in heading at most (degrees), up to 180.
-    deviations: float = 3.0  # Half width where a covariance is given, within the same limits (deviations).
+    deviations: float = 3.0  # What the graph's covariance adds to both (deviations).
 
     def __post_init__(self) -> None:
         check(self, "least_m", f"a positive number up to most_m, {self.most_m}", lambda x: 0.0 < x <= self.most_m)
         check(self, "most_m", "a finite number", math.isfinite)
         check(self, "least_deg", f"positive, up to most_deg, {self.most_deg}", lambda x: 0.0 < x <= self.most_deg)
         check(self, "most_deg", "at most 180", lambda x: x <= 180.0)
-        check(self, "share deg_per_m", "a number from 0 on", lambda x: x >= 0.0)
         check(self, "deviations", "a positive number", lambda x: x > 0.0)
 
 

@@ -133,13 +133,16 @@ class OwnMap:
         at = se2.compose(pose, se2.between(graph.poses[-1], graph.poses[stretch]))
         return evidence_of(scans, views, (stretch, at), (self._keys, self._poses), count_walls=True)
 
-    def contradicted(self, scans: Sequence[KeyScan], views: KeyScanViews, graph: PoseGraph, parts: np.ndarray) -> bool:
+    def contradicted(
+        self, scans: Sequence[KeyScan], views: KeyScanViews, graph: PoseGraph, windows: np.ndarray, parts: np.ndarray
+    ) -> bool:
         """Whether the key scans since the newest segment was joined show that it lies elsewhere.
 
         Two places may be alike for as far as the robot went; what it sees next is alike in one place alone.
         """
         first, newest = int(graph.segments[-1]), len(graph) - 1
-        others = np.flatnonzero(parts[segment_of(graph.segments, np.arange(first))] == parts[-1])
+        joined = parts[segment_of(graph.segments, np.arange(first))] == parts[-1]
+        others = np.flatnonzero(joined & (windows[:first, 0] <= _SURE_M))  # walls of a bent map lie elsewhere
         if self._trial == 0 or not len(others):
             return False
         last = np.arange(newest + 1 - self._config.loops.source_keys, newest + 1)

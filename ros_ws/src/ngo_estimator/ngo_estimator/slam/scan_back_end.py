@@ -13,13 +13,15 @@ from ngo_estimator.geometry.planar_covariance import bounded
 from ngo_estimator.geometry.planar_motion import between, compose, transformed
 from ngo_estimator.graph.corrector import CorrectedGraph, Corrector, GraphProblem, normal_equations
 from ngo_estimator.graph.normal_equations import NormalEquations
+from ngo_estimator.graph.path_covariance import covariances_of
 from ngo_estimator.graph.pose_graph import OPEN, PoseGraph
 from ngo_estimator.graph.redundant_nodes import redundant_nodes
 from ngo_estimator.graph.relative_poses import BELIEVED, RelativePoses
 from ngo_estimator.graph.robust import Robust
 from ngo_estimator.graph.segments import anchors, joined_parts, segment_of
+from ngo_estimator.graph.sparsification import largest_variances
 from ngo_estimator.loops.key_scan_store import KeyScanStore
-from ngo_estimator.loops.scan_loop_candidates import distance_windows, graph_distances
+from ngo_estimator.loops.scan_loop_candidates import covariance_windows
 from ngo_estimator.loops.scan_loop_finder import ScanLoopFinder
 from ngo_estimator.loops.scan_loops import ScanLoops
 from ngo_estimator.loops.scan_settings import ScanGraphConfig
@@ -143,9 +145,8 @@ class ScanBackEnd(BackEnd):
         """Ask for loops of the newest key."""
         begin = int(self.graph.streams[-1])
         if (len(self.graph) - 1 - begin) % self.config.loops.every == 0:
-            graph, joining = self.graph, self._joining_pairs
-            distances = graph_distances(graph.poses, joining, len(self.graph) - 1, graph.segments)
-            windows = distance_windows(self.config.windows, distances)
+            graph, joining = self.graph, self._joining_loops
+            windows = self._windows(joining)
             fresh = self._finder.find(self._scans, graph.poses, windows, segments=graph.borders, begin=begin)
             self._scans.compact()
             believed = self._finder.believed(fresh, graph)
@@ -153,8 +154,8 @@ class ScanBackEnd(BackEnd):
                 surprises = self._finder.use(believed, graph)
                 waited = self._wait - len(graph) // _KEYS_PER_SURPRISED if surprises else 1
                 self._waiting = max(self._waiting, waited)
-            self._parts = joined_parts(graph.segments, joining)
-            if self._own_map.contradicted(self._scans, self._finder.views, graph, self._parts):
+            self._parts = joined_parts(graph.segments, joining.pairs)
+            if self._own_map.contradicted(self._scans, self._finder.views, graph, windows, self._parts):
                 self._part_newest_segment()
                 return
             astray = self._own_map.astray(self._scans, self._finder.views, graph, windows, len(fresh) > 0)
@@ -179,18 +180,28 @@ class ScanBackEnd(BackEnd):
         self._drop_loops(lambda frames: (frames < first).any(1) & (frames >= first).any(1))
         self._waiting = self._wait + 1
 
-    @property
-    def _joining_pairs(self) -> np.ndarray:
-        """Keys ``(n, 2)`` that loops join: of two segments only where the last optimisation believed the loop."""
-        pairs = self._finder.loops.pairs[self._finder.used]
-        weight = np.zeros(len(pairs))
-        weight[: len(self.closed)] = self.closed.weight
-        return self._joining(pairs, weight)
+    def _windows(self, loops: ScanLoops) -> np.ndarray:
+        """Half widths ``(keys, 3)`` of the search around each key scan, as the graph knows the newest from there."""
+        graph = self.graph
+        edges = np.concatenate((graph.edges, loops.pairs))
+        covariance = np.concatenate((graph.step_covariance, loops.covariance))
+        variance = np.concatenate((graph.step_variance, largest_variances(loops.covariance)))
+        variance[graph.segments[1:] - 1] = math.inf
+        known = covariances_of(graph.poses, edges, covariance, variance, len(graph) - 1)
+        return covariance_windows(self.config.windows, known)
 
-    def _joining(self, pairs: np.ndarray, weight: np.ndarray) -> np.ndarray:
-        """Those of the keys ``(n, 2)`` that loops of this weight ``(n,)`` join."""
-        first, last = segment_of(self.graph.segments, pairs).T
-        return pairs[(first == last) | (weight > BELIEVED)]
+    @property
+    def _joining_loops(self) -> ScanLoops:
+        """Loops that join keys: of two segments only those that the last optimisation believed."""
+        loops = self.used_loops
+        weight = np.zeros(len(loops))
+        weight[: len(self.closed)] = self.closed.weight
+        return self._joining(loops, weight)
+
+    def _joining(self, loops: ScanLoops, weight: np.ndarray) -> ScanLoops:
+        """Those that join keys, where they have this weight ``(n,)``."""
+        first, last = segment_of(self.graph.segments, loops.pairs).T
+        return loops[(first == last) | (weight > BELIEVED)]
 
     def begin_stream(self, rank: int, ends: bool) -> None:
         """Begin another stream of steps with the next one, which begins a segment; all work is done.
@@ -217,7 +228,7 @@ class ScanBackEnd(BackEnd):
         for own_map in self._own_maps:
             own_map.renumber(number)
         self.closed = replace(self.closed, pairs=np.argsort(frames)[self.closed.pairs])
-        self._parts = joined_parts(self.graph.segments, self._joining_pairs)
+        self._parts = joined_parts(self.graph.segments, self._joining_loops.pairs)
         return frames
 
     @property
@@ -228,7 +239,7 @@ class ScanBackEnd(BackEnd):
         """The part of the map of each of some nodes ``(n,)``, and the node ``(n,)`` at which that part begins."""
         segments = self.graph.segments
         if len(self._parts) != len(segments):
-            self._parts = joined_parts(segments, self._joining_pairs)
+            self._parts = joined_parts(segments, self._joining_loops.pairs)
         own = segment_of(segments, nodes)
         return self._parts[own], self._anchors(self._parts)[own]
 
@@ -337,7 +348,7 @@ class ScanBackEnd(BackEnd):
                 solution = None
         if solution is None:
             solution = self._corrected(self.graph.poses)
-        parts = joined_parts(self.graph.segments, self._joining(loops.pairs, solution.loop_weights))
+        parts = joined_parts(self.graph.segments, self._joining(loops, solution.loop_weights).pairs)
         ends = self._end_covariances(solution, parts) if len(self.graph) > 1 else [self.graph.end]
         for end in ends:
             require_sound(solution.poses, end if end.any() else np.eye(3))  # none where the map begins
