@@ -85,7 +85,7 @@ def test_a_doubled_stamp_of_an_imu_loses_nothing() -> None:
 def test_a_robot_that_brakes_and_tilts_knows_its_way_by_an_imu() -> None:
     noise, pose, poses, records = np.random.default_rng(0), np.array((1.0, 1.0, 0.2)), [], list[LidarRecord]()
     for k in range(60):
-        stamp_ns, up = 10**12 + k * 10**8, up_of(math.radians(5.0) * math.sin(0.4 * k))
+        stamp_ns, up = 10**12 + k * 10**8, up_of(math.radians(9.0) * math.sin(0.4 * k))
         records.append(WheelPose(stamp_ns, between(np.array((1.0, 1.0, 0.2)), pose) * (1.05, 1.05, 1.0)))
         records.append(ImuReading(stamp_ns, 0.3 + 0.01 * noise.standard_normal(), up))
         seen, _ = scan(pose, up, stamp_ns)
