@@ -13,13 +13,7 @@ from ngo_recordings.laser_scan import LidarScan, ScanAngles, scan_angles
 from ngo_recordings.mounting import Mounting, find_mounting
 from ngo_recordings.recording import Recording
 from ngo_recordings.space_scan import scan_reader
-from ngo_recordings.topics import (
-    RecordingTopics,
-    WheelSource,
-    wheel_candidates,
-    wheel_topics_to_name,
-    wheel_transforms,
-)
+from ngo_recordings.topics import RecordingTopics, WheelSource, odometry_to_name, wheel_candidates
 
 _LOOK = 200
 
@@ -114,12 +108,8 @@ def _others(recording: Recording, topics: RecordingTopics, mounting: Mounting | 
             )
     if topics.no_wheels:
         return notes
-    if not wheels and topics.wheels is None:
-        named = wheel_topics_to_name(recording, topics.image, topics.ground_truth)
-        sources = [_with_rate(recording, name) for name in named]
-        sources += map(str, wheel_transforms(recording, topics.image, topics.ground_truth))
-        if sources:
-            notes.append(f"no odometry is used; if it is {' or '.join(sources)}, --wheels names it")
+    if not wheels and (note := odometry_to_name(recording, topics, lambda name: _with_rate(recording, name))):
+        notes.append(note)
     if len(wheels) > 1:
         taken = "no odometry" if topics.wheels is None else str(topics.wheels)
         there = ", ".join(_with_rate(recording, name) for name in wheels)

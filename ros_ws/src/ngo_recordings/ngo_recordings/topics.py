@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Collection, Iterable
+from collections.abc import Callable, Collection, Iterable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -264,6 +264,15 @@ def wheel_topics_to_name(recording: Recording, image: str, truth: GroundTruth | 
         if not other and not of_map and info.count >= span_s:
             found.append(name)
     return found
+
+
+def odometry_to_name(recording: Recording, topics: RecordingTopics, said: Callable[[str], str] = str) -> str | None:
+    """A sentence on what may be odometry where none is used, each topic as it is ``said``; None where nothing may."""
+    if topics.no_wheels or topics.wheels is not None:
+        return None
+    sources = [said(name) for name in wheel_topics_to_name(recording, topics.image, topics.ground_truth)]
+    sources += map(str, wheel_transforms(recording, topics.image, topics.ground_truth))
+    return f"no odometry is used; if it is {' or '.join(sources)}, --wheels names it" if sources else None
 
 
 def _is_any(names: Iterable[str], frame: str, beside: str) -> bool:

@@ -39,7 +39,7 @@ from ngo_estimator.trajectory.report import ReportSettings, remarks, report_tabl
 from ngo_recordings.calibration import CAMERA_INFO_TYPE
 from ngo_recordings.images import COMPRESSED_TYPE, IMAGE_TYPE, LIDAR_TYPES
 from ngo_recordings.recording import Recording, open_recording
-from ngo_recordings.topics import RecordingTopics, TopicArguments, choose_scan, choose_topics
+from ngo_recordings.topics import RecordingTopics, TopicArguments, choose_scan, choose_topics, odometry_to_name
 
 if TYPE_CHECKING:
     from ngo_estimator.frontend.camera.local_odometry import LocalOdometry
@@ -335,7 +335,6 @@ def _camera(arguments: Arguments, recording: Recording, console: Console) -> "St
     from ngo_recordings.frames import frames as frames_of
     from ngo_recordings.mounting import FLOOR_FRAME, find_pose
     from ngo_recordings.scan_stream import wheel_poses
-    from ngo_recordings.topics import wheel_topics_to_name, wheel_transforms
 
     cv2.setNumThreads(1)
     topics = choose_topics(recording, replace(arguments.topics, action="none", twist="none"), with_wheels=True)
@@ -355,11 +354,8 @@ def _camera(arguments: Arguments, recording: Recording, console: Console) -> "St
         seen = replace(seen, frame_id=frame)
         where = f"{frame} in {base} at {', '.join(f'{value:.3f}' for value in pose.position)} m (from {source})"
     model = calibrated_camera(seen, pose)
-    if by_floor and not topics.no_wheels:
-        sources = wheel_topics_to_name(recording, topics.image, topics.ground_truth)
-        sources += map(str, wheel_transforms(recording, topics.image, topics.ground_truth))
-        if sources:
-            console.print(f"no odometry is used; if it is {' or '.join(sources)}, --wheels names it")
+    if note := odometry_to_name(recording, topics):
+        console.print(note)
     odometry = PictureOdometry(model, by_floor=by_floor)
     used = f"using {_words(topics)}, calibration {info}"
     console.print("; ".join((used, *recording.notes)))
